@@ -50,6 +50,7 @@ def find(machine: Path, *, path: tuple[str, ...] = ("bin",), **environment: str)
         capture_output=True,
         text=True,
         timeout=60,
+        check=False,
     )
 
 
