@@ -48,10 +48,10 @@ def save(robot: Robot, path) -> None:
         raise RobotError(f"{path}: {error}") from None
     except UnicodeEncodeError:
         raise RobotError(f"{path}: a name or the source holds characters that UTF-8 cannot write.") from None
-    replace(path, data)
+    write(path, data)
 
 
-def replace(path: Path, data: bytes) -> None:
+def write(path: Path, data: bytes) -> None:
     """Write bytes to a file, whole or not at all."""
     if path.is_dir():
         raise RobotError(f"{path} is a folder; give the name of a file in it.")

@@ -86,10 +86,9 @@ def _parse(data: bytes):
             raise RobotError(f"the number {text[:20]} is not finite; every number must be.")
         return x
 
+    numbers = {"parse_float": finite, "parse_int": finite, "parse_constant": finite}
     try:
-        return json.loads(
-            data.decode("utf-8-sig"), object_pairs_hook=pairs, parse_float=finite, parse_int=finite, parse_constant=finite
-        )
+        return json.loads(data.decode("utf-8-sig"), object_pairs_hook=pairs, **numbers)
     except UnicodeDecodeError as error:
         raise RobotError(f"this is not UTF-8 text (byte {error.start}); save it as UTF-8.") from None
     except json.JSONDecodeError as error:
@@ -207,7 +206,7 @@ def write(robot: Robot) -> bytes:
         {"name": x.name, "kind": x.kind, "frame_a": end(x.frame_a), "frame_b": end(x.frame_b)} for x in robot.loops
     ]
     top["locked"] = {name: value[0] if len(value) == 1 else value for name, value in robot.locked.items()}
-    top = {key: value for key, value in top.items() if value is not False and not (value in ([], {}))}
+    top = {key: value for key, value in top.items() if value is not False and value not in ([], {})}
     return (_layout(top) + "\n").encode()
 
 
@@ -239,13 +238,14 @@ def _layout(value, indent: int = 0) -> str:
 
 def _filled(value: dict, indent: int) -> str:
     """An object whose entries fill lines like words."""
-    lines = ["{"]
-    for i, (k, v) in enumerate(value.items()):
-        entry = f"{json.dumps(k, ensure_ascii=False)}: {_one_line(v)}" + ("}" if i == len(value) - 1 else ",")
-        if len(lines[-1]) > 1 and len(lines[-1]) + len(entry) + indent + 1 > WIDTH:
-            lines.append(" ")
-        lines[-1] += entry if lines[-1] == "{" else " " + entry.lstrip() if lines[-1].strip() else entry
-    return ("\n" + " " * indent).join(lines)
+    lines = []
+    for key, entry in value.items():
+        word = _one_line({key: entry})[1:-1]
+        if lines and len(lines[-1]) + len(word) + indent + 4 <= WIDTH:
+            lines[-1] += ", " + word
+        else:
+            lines.append(word)
+    return "{" + (",\n " + " " * indent).join(lines) + "}"
 
 
 def _one_line(value) -> str:
@@ -255,7 +255,5 @@ def _one_line(value) -> str:
     if isinstance(value, list | tuple | np.ndarray):
         return "[" + ", ".join(map(_one_line, value)) + "]"
     if isinstance(value, float):  # np.float64 is one
-        x = float(value)
-        whole = x.is_integer() and abs(x) < 1e15 and math.copysign(1.0, x) * x >= 0 and not (x == 0 and math.copysign(1, x) < 0)
-        return str(int(x)) if whole else repr(x)
+        return repr(float(value)).removesuffix(".0")
     return json.dumps(value, ensure_ascii=False)
