@@ -87,7 +87,7 @@ def _parse(data: bytes):
         return fromstring(data, forbid_dtd=True)
     except ParseError as error:
         line, column = error.position
-        raise RobotError(f"this is not XML: {error.msg.split(':')[0]} at line {line}, column {column}.") from None
+        raise RobotError(f"this is not XML: {str(error).split(':')[0]} at line {line}, column {column}.") from None
     except DefusedXmlException:
         raise RobotError("this XML has a document type or entities, which are refused; take them out.") from None
     except (ValueError, LookupError) as error:
@@ -138,8 +138,10 @@ def _joint(element) -> dict:
     axis = np.array([1.0, 0.0, 0.0]) if axis is None else _vector(axis, "xyz", f"the axis of {here}")
     if not axis.any():
         raise RobotError(f"the axis of {here} is zero; give it a direction.")
-    axis = axis / np.abs(axis).max()  # no overflow on the way
-    out["axis"] = axis / np.linalg.norm(axis)
+    if abs(np.linalg.norm(axis) - 1.0) > 1e-6:
+        axis = axis / np.abs(axis).max()  # no overflow on the way
+        axis = axis / np.linalg.norm(axis)
+    out["axis"] = axis
     if dynamics is not None and dynamics.get("damping") is not None:
         out["damping"] = _number(dynamics, "damping", f"the dynamics of {here}")
     return out | _bounds(limit, kind, here)
