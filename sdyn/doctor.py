@@ -40,6 +40,7 @@ def examine(robot: Robot) -> tuple[Finding, ...]:
     """Everything that looks wrong: errors first, then warnings, then notes; each in the order of the parts."""
     found = [x for link in robot.links for x in _link(link)]
     found += [x for joint in robot.moving for x in _joint(joint)]
+    found += [x for name, value in robot.locked.items() for x in _locked(robot.joint(name), value)]
     found += _massless(robot)
     return tuple(sorted(found, key=lambda x: ("error", "warning", "note").index(x.level)))
 
@@ -117,6 +118,14 @@ def _joint(joint):
     if joint.limits is not None and joint.kind in ("revolute", "universal") and np.abs(joint.limits).max() > 8 * np.pi:
         wide = np.abs(joint.limits).max()
         yield Finding("note", part, f"has a limit of {wide:g} rad", "check the unit: radians, not degrees")
+
+
+def _locked(joint, value):
+    if joint.limits is not None:
+        low, high = np.reshape(joint.limits, (-1, 2)).T
+        if (value < low).any() or (value > high).any():
+            wrong = f"is locked at {value.tolist()}, beyond its limits {joint.limits}"
+            yield Finding("warning", f"joint {joint.name!r}", wrong, "lock it within them")
 
 
 def _massless(robot):

@@ -54,7 +54,9 @@ def crowded() -> Robot:
     robot = robot.lock({"revolute": 0.1, "planar": [1 / 3, 2, 3], "spherical": [1, 0, 0, 0]}).ground(
         "base", (rotation(rng), rng.normal(size=3))
     )
-    return robot.close("tip", "ground").close(Frame("mark", "bulky", rotation(rng)), "größe", "universal", name="second")
+    return robot.close("tip", "ground").close(
+        Frame("mark", "bulky", rotation(rng)), "größe", "universal", name="second"
+    )
 
 
 def faulty(tmp_path, name, data) -> str:
@@ -94,7 +96,7 @@ def test_json_is_laid_out_for_readers():
 def test_notes_are_for_readers(tmp_path):
     path = tmp_path / "robot.json"
     path.write_text(
-        '{"format": "sdyn-robot", "version": 1, "notes": "first", "links": [{"name": "a", "mass": 1, "notes": ["x", 1]}]}'
+        '{"format": "sdyn-robot", "version": 1, "notes": "one","links": [{"name": "a", "mass": 1, "notes": ["x", 1]}]}'
     )
     assert files.load(path) == Robot([Link("a", 1.0)])
 
@@ -182,7 +184,10 @@ def test_wrong_json(path, value, words, tmp_path):
 
 
 def test_missing_keys(tmp_path):
-    for path, words in [(("links", 0, "mass"), ["link 'a'", '"mass"']), (("joints", 0, "child"), ["joint 'j'", '"child"'])]:
+    for path, words in [
+        (("links", 0, "mass"), ["link 'a'", '"mass"']),
+        (("joints", 0, "child"), ["joint 'j'", '"child"']),
+    ]:
         top = copy.deepcopy(MINIMAL)
         del top[path[0]][path[1]][path[2]]
         message = faulty(tmp_path, "robot.json", json.dumps(top))
@@ -250,7 +255,9 @@ def test_urdf_reads_back_every_kind_it_has():
     axis = lambda: (a := rng.normal(size=3)) / np.linalg.norm(a)
     place = lambda: {"rotation": rotation(rng), "position": rng.normal(size=3)}
     joints = [
-        Joint("turn", "revolute", "a", "b", axis=axis(), limits=(-1, 1 / 3), rate=2.0, effort=0.1, damping=0.7, **place()),
+        Joint(
+            "turn", "revolute", "a", "b", axis=axis(), limits=(-1, 1 / 3), rate=2.0, effort=0.1, damping=0.7, **place()
+        ),
         Joint("spin", "revolute", "b", "c", axis=axis(), **place()),
         Joint("slide", "prismatic", "c", "d", axis=axis(), limits=(0, 1), **place()),
         Joint("push", "prismatic", "c", "e", axis=axis(), effort=3.0, **place()),
@@ -282,9 +289,11 @@ ARM = """<robot name="arm">
     <inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="2.5"/></inertial></link>
   <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 -4"/>
     <dynamics damping="0.5" friction="0.1"/>{inside}</joint>
-  <link name="b"><inertial><mass value="1e-1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="b"><inertial><mass value="1e-1"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
   <link name="flange"/><link name="tool"/>
-  <joint name="f" type="fixed"><parent link="b"/><child link="flange"/><origin xyz="0 0 1" rpy="0 0 1.57079632679"/></joint>
+  <joint name="f" type="fixed"><parent link="b"/><child link="flange"/>
+    <origin xyz="0 0 1" rpy="0 0 1.57079632679"/></joint>
   <joint name="t" type="fixed"><parent link="flange"/><child link="tool"/><origin xyz="1 0 0"/></joint>
   <transmission name="unknown"/>
 </robot>"""
@@ -367,11 +376,17 @@ def test_a_cycle_in_urdf(tmp_path):
 
 
 def test_entity_bombs_are_refused(tmp_path):
-    lines = ['<!ENTITY a "aaaaaaaaaa">', *(f'<!ENTITY {x} "{f"&{y};" * 10}">' for x, y in zip("bcdef", "abcde", strict=True))]
+    lines = [
+        '<!ENTITY a "aaaaaaaaaa">',
+        *(f'<!ENTITY {x} "{f"&{y};" * 10}">' for x, y in zip("bcdef", "abcde", strict=True)),
+    ]
     bomb = f"<?xml version='1.0'?><!DOCTYPE r [{''.join(lines)}]><robot name='&f;'/>"
     assert "entities" in faulty(tmp_path, "bomb.urdf", bomb)
     outside = '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="&x;"/>'
     assert "entities" in faulty(tmp_path, "outside.urdf", outside)
+
+
+BALL = Robot([Link("x", 1.0)], frames=[Frame("f", "x")])
 
 
 @pytest.mark.parametrize(
@@ -380,8 +395,8 @@ def test_entity_bombs_are_refused(tmp_path):
         (lambda r: r.close("hand", "ground", name="hold"), ["loop 'hold'", "open"]),
         (lambda r: r.lock({"joint2": 0.1}), ["'joint2'", "unlock"]),
         (lambda r: r.reroot("arm3"), ["'arm3'", "joint", "reroot"]),
-        (lambda r: r.attach(Robot([Link("x", 1.0)], frames=[Frame("f", "x")]), "hand", "f", "helical"), ["'hand_f'", "helical"]),
-        (lambda r: r.attach(Robot([Link("x", 1.0)], frames=[Frame("f", "x")]), "hand", "f", "spherical"), ["spherical"]),
+        (lambda r: r.attach(BALL, "hand", "f", "helical"), ["'hand_f'", "helical"]),
+        (lambda r: r.attach(BALL, "hand", "f", "spherical"), ["'hand_f'", "spherical"]),
         (lambda r: replace(r, joints=[replace(j, stiffness=1.0) for j in r.joints]), ["stiffness", "'joint1'"]),
         (lambda r: replace(r, joints=[replace(j, rotor_inertia=1.0) for j in r.joints]), ["rotor inertia", "'joint1'"]),
         (lambda r: replace(r, frames=(Frame("arm3", "arm7"),)), ["'arm3'", "rename"]),
@@ -479,7 +494,7 @@ def test_a_failed_write_leaves_the_old_file(step, fault, tmp_path, monkeypatch):
         raise fault
 
     monkeypatch.setattr(os, step, fail)
-    with pytest.raises((RobotError, KeyboardInterrupt), match="No space left|^$"):
+    with pytest.raises((RobotError, KeyboardInterrupt), match=r"No space left|^$"):
         files.save(models.load("deos7"), path)
     assert [x.name for x in tmp_path.iterdir()] == ["robot.json"]
     assert files.load(path) == models.load("sat50")

@@ -60,7 +60,8 @@ def test_names_of_coordinates():
 
 def test_configuration_by_names():
     robot = every_kind()
-    q = dict(zip(robot.q_names, robot.configuration({"planar": [1, 2, 3], "helical": 4}, position=(5, 6, 7)), strict=True))
+    q = robot.configuration({"planar": [1, 2, 3], "helical": 4}, position=(5, 6, 7))
+    q = dict(zip(robot.q_names, q, strict=True))
     assert [q[f"planar.{x}"] for x in ("x", "y", "angle")] == [1, 2, 3]
     assert (q["helical"], q["base.z"], q["base.qw"], q["spherical.qw"], q["revolute"]) == (4, 7, 1, 1, 0)
     assert np.array_equal(robot.neutral(), robot.configuration())
@@ -260,7 +261,7 @@ def test_numbering_rule_of_a_branched_system():
 
 
 def test_example_2_closes_loops_inverts_and_grounds():
-    """Example IV-B: three arms; end-effector 2 joined to 1, inversion to end-effector 1, ground, the third arm closed."""
+    """Example IV-B: end-effector 2 joined to 1, inversion to end-effector 1, ground, the third arm closed to ground."""
     parents = {"0": None, "1": "0", "2": "1", "3": "2", "4": "0", "5": "4", "6": "0", "7": "6"}
     robot = tree(parents, tips=("3", "5", "7")).close("tip_5", "tip_3")
     assert [row.cflag for row in robot.table()] == [-1, -1, -1, -1, 3, -1, -1]
