@@ -41,7 +41,7 @@ def examine(robot: Robot) -> tuple[Finding, ...]:
     found = [x for link in robot.links for x in _link(link)]
     found += [x for joint in robot.moving for x in _joint(joint)]
     found += [x for name, value in robot.locked.items() for x in _locked(robot.joint(name), value)]
-    found += _massless(robot)
+    found += _massless(repaired(robot))
     return tuple(sorted(found, key=lambda x: ("error", "warning", "note").index(x.level)))
 
 
