@@ -1,0 +1,21 @@
+"""Differentiable dynamics in JAX for robots whose kinematic structure changes while they work.
+
+In reading order: parts and edits of a robot (host, raises), packing (the gate), dynamics (device, pure JAX).
+"""
+
+# host stage
+from sdyn import models
+from sdyn.checks import RobotError
+from sdyn.files import load, save
+from sdyn.parts import Frame, Joint, Link, Loop
+from sdyn.robot import Robot
+
+# the gate
+from sdyn.chain import Capacity, Chain, Params
+from sdyn.pack import capacity, family, pack, pad, unpad
+
+# device stage
+from sdyn.kinematics import body_poses, frame_acceleration, frame_jacobian, frame_pose, frame_velocity
+from sdyn.dynamics import bias_force, forward_dynamics, inverse_dynamics, mass_matrix, solve_mass
+from sdyn.momentum import centre_of_mass, generalised_jacobian, kinetic_energy, momentum
+from sdyn.params import params, regressor, with_params

@@ -1,0 +1,161 @@
+"""Declarations: a `Capacity` holds sizes and is the compile key; a `Chain` is a structure packed into arrays of them.
+
+Slots: the bodies are numbered `t W + w` in a schedule of T steps of width W, one degree of freedom each; the base is
+slot `T W`, and slot `T W + 1` is a dummy that empty slots point to. Links locked together share a slot.
+"""
+
+import zlib
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sdyn.checks import RobotError, known
+
+# rows of Chain.slot_index, .slot_value, .base_value, .link_index, .joint_index, .joint_value
+PARENT, DOF, QUAT, LIVE, JOINT, SCREW, SIGN, FORWARD, FIRST, FROM = range(10)
+C0, C1, C2, POINT, SLIDE, AXIS, MASS, COM, INERTIA, SLOT_ROWS = 0, 9, 18, 27, 30, 33, 39, 40, 43, 52
+BASE_FREE, BASE_POSE, BASE_ROWS = 13, 14, 21
+LINK_NAME, LINK_SLOT, LINK_POINTER, LINK_JOINT, LINK_FORWARD, LINK_FIXED = range(6)
+JOINT_NAME, JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_PRESENT = range(5)
+PLACE_R, PLACE_P, SCREWS, LOCK, LOCK_QUAT, JOINT_ROWS = 0, 9, 12, 30, 33, 37
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Sizes of the arrays of a family of structures, and the names behind the indices.
+
+    Two capacities with the same numbers are the same compile key, whatever the names.
+    """
+
+    steps: int
+    """Steps of the schedule, T."""
+    width: int
+    """Bodies in a step, W."""
+    links: int
+    joints: int
+    frames: int
+    nq: int
+    """Entries of q behind the base block."""
+    nv: int
+    """Entries of v behind the base block."""
+    quaternions: int
+    """Moving spherical joints."""
+    layout: str
+    """"free" or "grounded": exact arrays of one structure; "padded": a base block always, zeros at the end."""
+    link_names: tuple[str, ...] = field(compare=False)
+    joint_names: tuple[str, ...] = field(compare=False)
+    frame_names: tuple[str, ...] = field(compare=False)
+
+    @property
+    def slots(self) -> int:
+        """Slots of bodies other than the base."""
+        return self.steps * self.width
+
+    @property
+    def base_nq(self) -> int:
+        """Entries of q of the base block."""
+        return 0 if self.layout == "grounded" else 7
+
+    @property
+    def base_nv(self) -> int:
+        """Entries of v of the base block."""
+        return 0 if self.layout == "grounded" else 6
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Chain:
+    """A structure, packed. Everything but `capacity` is traced: a change of structure is a change of data.
+
+    Differentiable in every float array; `slot_value`, `base_value` and `link_pose` follow from the original links and
+    joints (`with_params` derives them anew).
+    """
+
+    slot_index: Int[Array, "10 steps width"]
+    """Per slot: parent slot, degree of freedom, quaternion, live, joint, screw and its sign, joint
+    traversed forward, first of its joint, link it hangs from."""
+    slot_value: Float[Array, "steps 52 width"]
+    """Per slot: rotation C0 + C1 cos q + C2 sin q in the parent's slot [9 each], its point and slide [m, m per unit
+    of q], axis [a; b], and mass, centre and inertia of its body [kg, m, kg m^2]."""
+    base_value: Float[Array, " 21"]
+    """Mass, centre, inertia of the base body; 1 if it is free; pose of a grounded base [m, wxyz]."""
+    ancestors: Bool[Array, "slots slots"]
+    """[i, j]: whether slot j carries slot i, or is it."""
+    link_index: Int[Array, "6 links"]
+    """Per link: hash of its name, slot, link its locked joint hangs from, joint, forward, locked."""
+    link_mass: Float[Array, " links"]
+    link_com: Float[Array, "links 3"]
+    link_inertia: Float[Array, "links 3 3"]
+    """Mass, centre and inertia about it of the original links, link axes [kg, m, kg m^2]."""
+    link_pose: Float[Array, "links 12"]
+    """Rotation and position of each link in its slot [-, m]."""
+    joint_index: Int[Array, "5 joints"]
+    """Per joint: hash of its name, moves, first entry of q behind the base block, entries of q, present."""
+    joint_value: Float[Array, "joints 37"]
+    """Per joint: rotation and position in the declared parent, three screws, lock values, lock quaternion."""
+    dof_value: Float[Array, "3 nv"]
+    """Damping, stiffness and rotor inertia of each degree of freedom."""
+    quat_index: Int[Array, "3 quaternions"]
+    """Per quaternion: first entry of q, first of v behind the base block, 1 if the joint is traversed backwards."""
+    dof_to_q: Int[Array, " nv"]
+    """Entry of q behind the base block that belongs to each degree of freedom; -1 for spherical and empty ones."""
+    frame_index: Int[Array, "2 frames"]
+    """Per frame: hash of its name, link."""
+    frame_value: Float[Array, "frames 12"]
+    """Rotation and position of each frame in its link [-, m]."""
+    capacity: Capacity = field(metadata={"static": True})
+
+    @property
+    def dtype(self):
+        """Floating-point type of the structure, and of what is computed with it."""
+        return self.slot_value.dtype
+
+    @property
+    def free(self):
+        """1 if the base is free, 0 if it is grounded."""
+        return self.base_value[BASE_FREE]
+
+    @property
+    def nq(self) -> int:
+        """Entries of q."""
+        return self.capacity.base_nq + self.capacity.nq
+
+    @property
+    def nv(self) -> int:
+        """Entries of v."""
+        return self.capacity.base_nv + self.capacity.nv
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Params:
+    """Inertial parameters of the original links, to differentiate or to estimate."""
+
+    mass: Float[Array, " n"]
+    """Masses [kg]."""
+    com: Float[Array, "n 3"]
+    """Centres of mass, link axes [m]."""
+    inertia: Float[Array, "n 3 3"]
+    """Inertias about the centres of mass, link axes [kg m^2]."""
+
+
+def index_of(name, names: tuple[str, ...], hashes, what: str):
+    """The index of a name or an index, by the hash of the name: names are data, so another robot of the same
+    capacity finds its own.
+
+    Raises:
+        RobotError: While tracing, if no such name exists.
+    """
+    if not isinstance(name, str):
+        if isinstance(name, int) and not -len(names) <= name < len(names):
+            raise RobotError(f"there is no {what} {name}; the structure has {len(names)}.")
+        return name
+    known(name, names, what)
+    return jnp.argmax(hashes == name_hash(name))
+
+
+def name_hash(name: str) -> int:
+    """A 31-bit hash of a name, the same in every process."""
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF

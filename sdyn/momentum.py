@@ -1,0 +1,94 @@
+"""Energy, momentum and centre of mass, and the Jacobian of a free-floating frame at given momentum."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sdyn.chain import BASE_FREE, LINK_SLOT, Chain
+from sdyn.coordinates import pose_of, rates_of
+from sdyn.dynamics import mass_matrix
+from sdyn.inputs import expect
+from sdyn.kinematics import frame_jacobian, link_motions, link_poses, poses
+
+
+def centre_of_mass(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "3"]:
+    """Centre of mass of all links, world [m].
+
+    Args:
+        chain: Packed structure.
+        q: Configuration [m, rad, unit quaternion wxyz].
+    """
+    (q,) = expect(chain, q=q)
+    pose = pose_of(chain, q)
+    slots, _ = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
+    R, p = link_poses(chain, slots[..., 0])
+    return pose.p + pose.R @ _centre(chain, R, p)
+
+
+def momentum(chain: Chain, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
+    """Angular momentum about the centre of mass and linear momentum, world axes [N m s, N s].
+
+    Args:
+        chain: Packed structure.
+        q, v: State.
+    """
+    q, v = expect(chain, q=q, v=v)
+    pose = pose_of(chain, q)
+    R, p, V, _ = link_motions(chain, pose, v, jnp.zeros_like(v))
+    h = link_momenta(chain, R, p, V)
+    L, P = h[:, :3].sum(0), h[:, 3:].sum(0)
+    return jnp.concatenate([pose.R @ (L - jnp.cross(_centre(chain, R, p), P)), pose.R @ P])
+
+
+def kinetic_energy(chain: Chain, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, ""]:
+    """Kinetic energy, rotors included [J].
+
+    Args:
+        chain: Packed structure.
+        q, v: State.
+    """
+    q, v = expect(chain, q=q, v=v)
+    pose = pose_of(chain, q)
+    R, p, V, _ = link_motions(chain, pose, v, jnp.zeros_like(v))
+    _, qd = rates_of(chain, pose, v)
+    return 0.5 * ((V * link_momenta(chain, R, p, V)).sum() + (chain.dof_value[2] * qd[:, 0] ** 2).sum())
+
+
+def generalised_jacobian(chain: Chain, q: Float[Array, " nq"], frame) -> Float[Array, "6 joints"]:
+    """Jacobian of a frame with respect to the joints alone, the free base reacting at zero momentum.
+
+    Args:
+        chain: Packed structure; the plain joint Jacobian when the base is grounded.
+        q: Configuration.
+        frame: Name, or index, which may be traced.
+
+    Returns:
+        J_m - J_b M_bb^-1 M_bm, angular rows first, world axes, at the frame's origin.
+
+    Source:
+        Umetani and Yoshida, Resolved motion rate control of space manipulators (1989).
+    """
+    (q,) = expect(chain, q=q)
+    J = frame_jacobian(chain, q, frame)
+    if chain.capacity.base_nv == 0:
+        return J
+    M = mass_matrix(chain, q)
+    # a grounded base of the padded layout has no mass; its columns of J are zero
+    Mbb = M[:6, :6] + jnp.eye(6, dtype=M.dtype) * (1 - chain.base_value[BASE_FREE])
+    return J[:, 6:] - J[:, :6] @ jnp.linalg.solve(Mbb, M[:6, 6:])
+
+
+def link_momenta(chain: Chain, R, p, V):
+    """Momentum [n; f] of every link about the base's origin, base axes [n, 6]; only twists V are moving."""
+    m = chain.link_mass[:, None]
+    x = p + (R @ chain.link_com[..., None])[..., 0]
+    P = m * (V[:, 3:] + jnp.cross(V[:, :3], x))
+    I = R @ chain.link_inertia @ jnp.swapaxes(R, 1, 2)
+    return jnp.concatenate([(I @ V[:, :3, None])[..., 0] + jnp.cross(x, P), P], 1)
+
+
+def _centre(chain, R, p):
+    """Centre of mass in base axes."""
+    x = p + (R @ chain.link_com[..., None])[..., 0]
+    present = chain.link_index[LINK_SLOT] <= chain.capacity.slots
+    m = jnp.where(present, chain.link_mass, 0)
+    return (m @ x) / m.sum()

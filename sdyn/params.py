@@ -1,0 +1,88 @@
+"""Inertial parameters of the original links: read them, replace them, and the equations of motion linear in them."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sdyn.chain import BASE_FREE, LINK_SLOT, Chain, Params
+from sdyn.coordinates import gravity_of, pose_of
+from sdyn.inputs import expect
+from sdyn.kinematics import jacobian_columns, link_motions, poses
+from sdyn.merge import derive
+
+
+def params(chain: Chain) -> Params:
+    """Masses, centres of mass and inertias of the original links, as a pytree."""
+    return Params(chain.link_mass, chain.link_com, chain.link_inertia)
+
+
+def with_params(chain: Chain, params: Params) -> Chain:
+    """The chain with other inertial parameters; differentiable, and compiles nothing new.
+
+    Args:
+        chain: Packed structure.
+        params: One entry for each original link, locked ones included. Physical consistency is the caller's.
+    """
+    return rederived(replace(chain, link_mass=params.mass, link_com=params.com, link_inertia=params.inertia))
+
+
+def rederived(chain: Chain) -> Chain:
+    """The chain with its slots, base and link poses derived anew from links, joints and lock values."""
+    inertial = chain.link_mass, chain.link_com, chain.link_inertia
+    value, base, link_pose = derive(jnp, chain.slot_index, chain.link_index, chain.joint_value, *inertial)
+    base_value = jnp.concatenate([base, chain.base_value[BASE_FREE:]])
+    return replace(chain, slot_value=value, base_value=base_value, link_pose=link_pose)
+
+
+def regressor(
+    chain: Chain,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    vdot: Float[Array, " nv"],
+    *,
+    gravity: Float[Array, "3"] | None = None,
+) -> Float[Array, "nv 10n"]:
+    """The matrix Y of inverse dynamics, tau = Y theta, without damping, stiffness and rotors.
+
+    Args:
+        chain: Packed structure.
+        q, v, vdot: State and acceleration.
+        gravity: Acceleration of free fall, world axes [m/s^2].
+
+    Returns:
+        Columns per original link: mass, first moment m c (3), inertia about the link's origin (xx xy xz yy yz zz).
+
+    Source:
+        Atkeson, An and Hollerbach, Estimation of inertial parameters (1986).
+    """
+    q, v, vdot, gravity = expect(chain, q=q, v=v, vdot=vdot, gravity=gravity)
+    pose = pose_of(chain, q)
+    R, p, V, A = link_motions(chain, pose, v, vdot)
+    if gravity is not None:
+        A = A - gravity_of(pose, gravity)[:, 0]
+    # into link axes, about the link's origin
+    turn = lambda x: jnp.einsum("nji,nj->ni", R, x)
+    w, al = turn(V[:, :3]), turn(A[:, :3])
+    u, a = turn(V[:, 3:] + jnp.cross(V[:, :3], p)), turn(A[:, 3:] + jnp.cross(A[:, :3], p))
+    a = a + jnp.cross(w, u)  # classical acceleration of the origin
+    hat = lambda x: jnp.stack([jnp.cross(x, e) for e in jnp.eye(3, dtype=x.dtype)], 2)
+    hw, hal, ha = hat(w), hat(al), hat(a)
+    force = jnp.concatenate([a[:, :, None], hal + hw @ hw, jnp.zeros((*a.shape, 6), a.dtype)], 2)
+    moment = jnp.concatenate([jnp.zeros_like(a)[:, :, None], -ha, _inertia_columns(al) + hw @ _inertia_columns(w)], 2)
+    # wrench of each link, columns per parameter, back to base axes and the base's origin
+    force, moment = R @ force, R @ moment
+    moment = moment + jnp.cross(p[:, :, None], force, axis=1)
+    wrench = jnp.concatenate([moment, force], 1)
+
+    _, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
+    columns = jacobian_columns(chain, pose, S[..., 0], chain.link_index[LINK_SLOT])
+    return jnp.einsum("nkv,nkc->vnc", columns, wrench).reshape(chain.nv, -1)
+
+
+def _inertia_columns(w):
+    """The matrix with I w = L(w) [xx xy xz yy yz zz]."""
+    o = jnp.zeros_like(w[:, 0])
+    x, y, z = w.T
+    rows = [[x, y, z, o, o, o], [o, x, o, y, z, o], [o, o, x, o, y, z]]
+    return jnp.stack([jnp.stack(row, 1) for row in rows], 1)
