@@ -1,0 +1,272 @@
+"""PNG figures of a plan, with matplotlib's own objects: no window, no global state.
+
+In every figure the phases are tinted bands, named in the legend; limits are dashed.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+import sdyn
+from planners.motion import body_momentum, continuous, frame_motion, momentum, quaternions
+
+BLUE, RED, GREEN, PURPLE, INK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#222222"  # Okabe and Ito's palette
+BANDS = ("#E8E8E8", "#DCEBF7", "#FCE9CF", "#DDF1E7", "#F4E3EE")
+FAR = 5.0  # a limit this many times beyond the curve is named, not drawn
+
+
+def draw(plan, folder) -> list[Path]:
+    """Draw all figures of a plan.
+
+    Args:
+        plan: A `Plan`.
+        folder: Where the files go; existing ones are replaced.
+
+    Returns:
+        The paths of the files.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = {f"joint_{what}": joints(plan, what) for what in QUANTITIES}
+    figures |= {"base": base(plan), "momentum": momenta(plan)}
+    if plan.task.kind == "grasp":
+        figures["grasp"] = grasp(plan)
+    paths = []
+    for name, figure in figures.items():
+        paths.append(folder / f"{name}.png")
+        figure.savefig(paths[-1], dpi=110)
+    return paths
+
+
+# -- joints ------------------------------------------------------------------------------------------------------------
+
+QUANTITIES = {  # title, where it is, unit of a slide and of a turn
+    "angles": ("Joint positions", "q", ("m", "rad")),
+    "rates": ("Joint rates", "v", ("m/s", "rad/s")),
+    "torques": ("Joint torques", "tau", ("N", "N m")),
+}
+SLIDES = (".slide", ".x", ".y")
+
+
+def joints(plan, what: str) -> Figure:
+    """One panel for each joint coordinate: `what` is angles, rates or torques."""
+    title, key, units = QUANTITIES[what]
+    bounds = _bounds(plan.task, what)
+    names = list(dict.fromkeys(name for phase in plan.phases for name in _coordinates(phase.robot, key)))
+    figure, panels = _sheet(plan, title, len(names), dashed="limit")
+    for panel, name in zip(panels, names, strict=True):
+        curves = []
+        for phase in plan.phases:
+            have = _coordinates(phase.robot, key)
+            if name in have:
+                curves.append((phase.times, getattr(phase, key)[:, have[name]]))
+        for times, values in curves:
+            panel.plot(times, values, color=BLUE, linewidth=1.3)
+        joint = _joint_of(plan.phases[0].robot, name)
+        unit = units[0] if joint.kind == "prismatic" or name.endswith(SLIDES) else units[1]
+        panel.set_title(name, fontsize=9, loc="left")
+        panel.set_ylabel(unit, fontsize=8)
+        _limits(panel, np.concatenate([values for _, values in curves]), bounds.get(name))
+    return figure
+
+
+def _coordinates(robot, key) -> dict[str, int]:
+    """Name and index of each coordinate of the joints, without the base."""
+    names = robot.q_names if key == "q" else robot.v_names
+    skip = 0 if robot.grounded else 7 if key == "q" else 6
+    return {name: k for k, name in enumerate(names) if k >= skip}
+
+
+def _joint_of(robot, coordinate) -> sdyn.Joint:
+    """The joint that a coordinate belongs to."""
+    return robot.joint(coordinate if coordinate in {j.name for j in robot.joints} else coordinate.rpartition(".")[0])
+
+
+def _bounds(task, what) -> dict[str, tuple[float, float]]:
+    """(lower, upper) for each joint of the task."""
+    if what == "angles":
+        pairs = task.position_limits
+    else:
+        most = task.rate_limits if what == "rates" else task.torque_limits
+        pairs = np.column_stack([-most, most])
+    return {joint.name: tuple(pair) for joint, pair in zip(task.joints, pairs, strict=True)}
+
+
+def _limits(panel, values, pair):
+    """Dash the limits that are near the curve; name those that are far off."""
+    low, high = float(values.min()), float(values.max())
+    finite = [x for x in pair or () if np.isfinite(x)]
+    size = max(abs(low), abs(high), 1e-12)
+    near = [x for x in finite if abs(x) <= FAR * size]
+    for x in near:
+        panel.axhline(x, color=RED, linestyle="--", linewidth=1.0)
+    far = [x for x in finite if abs(x) > FAR * size]
+    if far:
+        same = len(far) == 2 and np.isclose(far[0], -far[1])
+        text = f"\u00b1{far[1]:.3g}" if same else " and ".join(f"{x:.3g}" for x in far)
+        panel.text(0.99, 0.97, f"limit {text}", transform=panel.transAxes, ha="right", va="top", fontsize=7, color=RED)
+    low, high = min([low, *near]), max([high, *near])
+    room = 0.08 * max(high - low, 1e-9)
+    panel.set_ylim(low - room, high + (2.5 * room if far else room))
+
+
+# -- base and momentum -------------------------------------------------------------------------------------------------
+
+
+def base(plan) -> Figure:
+    """Position, attitude and angular velocity of the base, against its start."""
+    name = plan.phases[0].robot.base
+    figure, panels = _sheet(plan, f"Motion of the base, {name!r}", 3, columns=1, height=2.0, lines="xyz")
+    zero = None
+    for phase in plan.phases:
+        R, p, w = _base_motion(phase, name)
+        zero = zero or (R[0], p[0])
+        for panel, values in zip(panels, (p - zero[1], rotation_vectors(zero[0].T @ R), w), strict=True):
+            _components(panel, phase.times, values)
+    for panel, title, unit in zip(
+        panels,
+        ("Position, world axes, from the start", "Rotation vector from the start", "Angular velocity, base axes"),
+        ("m", "rad", "rad/s"),
+        strict=True,
+    ):
+        panel.set_title(title, fontsize=9, loc="left")
+        panel.set_ylabel(unit, fontsize=8)
+    return figure
+
+
+def _base_motion(phase, name):
+    """Rotations [k, 3, 3], positions [k, 3] and angular velocities in own axes [k, 3] of a link."""
+    R, p, twist = frame_motion(phase.robot, phase.q, phase.v, sdyn.Frame("base", name))
+    return R, p, np.einsum("kji,kj->ki", R, twist[:, :3])
+
+
+def momenta(plan) -> Figure:
+    """Momentum of the chaser, of the target and of both, about the world's origin."""
+    capture = any(phase.passive for phase in plan.phases)
+    lines = {"chaser": BLUE, "target": RED, "total": INK} if capture else {"total": INK}
+    figure, panels = _sheet(
+        plan, "Momentum, world axes, angular about the origin", 6, columns=3, height=2.3, lines=lines
+    )
+    for phase in plan.phases:
+        for name, values in _shares(plan, phase).items():
+            for panel, column in zip(panels, (3, 4, 5, 0, 1, 2), strict=True):
+                style = {"color": lines[name], "linewidth": 2.4 if name == "total" else 1.3}
+                panel.plot(phase.times, values[:, column], **style, alpha=0.6 if name == "total" else 1.0)
+    for panel, axis in zip(panels, "xyzxyz", strict=True):
+        panel.set_title(axis, fontsize=9, loc="left")
+    panels[0].set_ylabel("linear, N s", fontsize=8)
+    panels[3].set_ylabel("angular, N m s", fontsize=8)
+    return figure
+
+
+def _shares(plan, phase) -> dict[str, np.ndarray]:
+    """Momentum [k, 6] of the chaser, of the target and in total; of a robot alone only the total."""
+    whole = momentum(phase.robot, phase.q, phase.v)
+    first = next((other.passive[0] for other in plan.phases if other.passive), None)
+    if first is None:
+        return {"total": whole}
+    link = first.link(first.base)
+    robot, q, v = phase.passive or (phase.robot, phase.q, phase.v)
+    target = body_momentum(link, *frame_motion(robot, q, v, sdyn.Frame("target", link.name)))
+    chaser = whole if phase.passive else whole - target
+    return {"chaser": chaser, "target": target, "total": chaser + target}
+
+
+# -- grasp -------------------------------------------------------------------------------------------------------------
+
+
+def grasp(plan) -> Figure:
+    """Distance, angle and relative velocity between the hand and the grasp frame, up to the grasp."""
+    figure, panels = _sheet(
+        plan, "Hand and grasp frame, until the grasp", 4, height=2.3, dashed="tolerance of tracking"
+    )
+    tolerance = plan.task.tolerance
+    before = [phase for phase in plan.phases if phase.passive]
+    for phase in before:
+        for panel, values in zip(panels, separation(plan.task, phase), strict=True):
+            panel.semilogy(phase.times, np.maximum(values, 1e-16), color=BLUE, linewidth=1.3)
+    bounds = (tolerance.position, tolerance.angle, tolerance.speed, None)
+    titles = ("Distance", "Angle", "Relative speed", "Relative angular speed")
+    for panel, title, unit, most in zip(panels, titles, ("m", "rad", "m/s", "rad/s"), bounds, strict=True):
+        panel.set_title(title, fontsize=9, loc="left")
+        panel.set_ylabel(unit, fontsize=8)
+        panel.set_xlim(before[0].times[0], before[-1].times[-1])
+        tracking = [phase for phase in before if phase.name == "track"]
+        if most and tracking:
+            panel.hlines(most, tracking[0].times[0], tracking[0].times[-1], color=RED, linestyle="--", linewidth=1.2)
+        low, high = panel.get_ylim()
+        panel.set_ylim(max(low, 1e-9 * high), high)
+    return figure
+
+
+def separation(task, phase) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Between hand and target: distance [m], angle [rad], relative speed [m/s] and angular speed [rad/s], each [k]."""
+    robot, q, v = phase.passive
+    handle = next(x for x in robot.frames if x.name in (task.target.frame, f"target_{task.target.frame}"))
+    R_H, p_H, v_H = frame_motion(phase.robot, phase.q, phase.v, phase.robot.frame(task.robot.frame))
+    R_T, p_T, v_T = frame_motion(robot, q, v, handle)
+    gap = p_T - p_H
+    relative = v_T - v_H
+    relative[:, 3:] -= np.cross(v_H[:, :3], gap)  # seen from the hand
+    turn = rotation_vectors(np.einsum("kji,kjl->kil", R_H, R_T))
+    return tuple(np.linalg.norm(x, axis=1) for x in (gap, turn, relative[:, 3:], relative[:, :3]))
+
+
+def rotation_vectors(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors [k, 3] (rad) of rotation matrices [k, 3, 3], without jumps along k."""
+    q = continuous(quaternions(R))
+    q = q if q[0, 0] >= 0 else -q
+    size = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, q[:, :1])
+    return np.where(size > 1e-12, angle / np.maximum(size, 1e-300), 2.0) * q[:, 1:]
+
+
+# -- layout ------------------------------------------------------------------------------------------------------------
+
+
+def _sheet(plan, title, count, *, columns=None, height=1.7, lines=None, dashed=None):
+    """A figure with `count` panels over time, the phases tinted, and one legend for all."""
+    columns = columns or (1 if count == 1 else 2 if count <= 8 else 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(10.0, 0.9 + height * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    panels = list(grid.flat)
+    for panel in panels[count:]:
+        panel.remove()
+    for panel in panels[:count]:
+        panel.tick_params(labelsize=8)
+        panel.grid(color="white", linewidth=0.8)
+        panel.set_axisbelow(True)
+        for tint, phase in zip(_tints(plan), plan.phases, strict=True):
+            panel.axvspan(phase.times[0], phase.times[-1], color=tint, linewidth=0, zorder=0)
+        for spine in ("top", "right"):
+            panel.spines[spine].set_visible(False)
+        panel.margins(x=0)
+    for panel in panels[max(count - columns, 0) : count]:
+        panel.tick_params(labelbottom=True)
+    figure.supxlabel("time, s", fontsize=9)
+    handles = _legend(plan, lines, dashed)
+    text = {"title_fontproperties": {"size": 12, "weight": "bold"}, "fontsize": 9, "alignment": "left"}
+    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), frameon=False, title=title, **text)
+    return figure, panels[:count]
+
+
+def _tints(plan):
+    return [BANDS[k % len(BANDS)] for k in range(len(plan.phases))]
+
+
+def _legend(plan, lines, dashed):
+    """Handles for curves, limits and phases."""
+    lines = dict(zip("xyz", (BLUE, RED, GREEN), strict=True)) if lines == "xyz" else lines or {}
+    curves = [Line2D([], [], color=color, label=name) for name, color in lines.items()]
+    limits = [Line2D([], [], color=RED, linestyle="--", label=dashed)] if dashed else []
+    bands = [Patch(color=tint, label=phase.name) for tint, phase in zip(_tints(plan), plan.phases, strict=True)]
+    return curves + limits + bands
+
+
+def _components(panel, times, values):
+    for color, column in zip((BLUE, RED, GREEN), values.T, strict=True):
+        panel.plot(times, column, color=color, linewidth=1.3)

@@ -1,0 +1,7 @@
+"""`python -m sdyn`: the command line."""
+
+import sys
+
+from sdyn.cli import main
+
+sys.exit(main())
