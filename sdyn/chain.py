@@ -17,8 +17,8 @@ from sdyn.checks import RobotError, known
 PARENT, DOF, QUAT, LIVE, JOINT, SCREW, SIGN, FORWARD, FIRST, FROM = range(10)
 C0, C1, C2, POINT, SLIDE, AXIS, MASS, COM, INERTIA, SLOT_ROWS = 0, 9, 18, 27, 30, 33, 39, 40, 43, 52
 BASE_FREE, BASE_POSE, BASE_ROWS = 13, 14, 21
-LINK_NAME, LINK_SLOT, LINK_POINTER, LINK_JOINT, LINK_FORWARD, LINK_FIXED = range(6)
-JOINT_NAME, JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_PRESENT = range(5)
+LINK_NAME, LINK_SLOT, LINK_PARENT, LINK_JOINT, LINK_FORWARD, LINK_FIXED = range(6)
+JOINT_NAME, JOINT_PRESENT, JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_V, JOINT_DOF, JOINT_PARENT, JOINT_CHILD = range(9)
 PLACE_R, PLACE_P, SCREWS, LOCK, LOCK_QUAT, JOINT_ROWS = 0, 9, 12, 30, 33, 37
 
 
@@ -84,15 +84,16 @@ class Chain:
     ancestors: Bool[Array, "slots slots"]
     """[i, j]: whether slot j carries slot i, or is it."""
     link_index: Int[Array, "6 links"]
-    """Per link: hash of its name, slot, link its locked joint hangs from, joint, forward, locked."""
+    """Per link: hash of its name, slot, parent in the tree, joint to it, forward, locked."""
     link_mass: Float[Array, " links"]
     link_com: Float[Array, "links 3"]
     link_inertia: Float[Array, "links 3 3"]
     """Mass, centre and inertia about it of the original links, link axes [kg, m, kg m^2]."""
     link_pose: Float[Array, "links 12"]
     """Rotation and position of each link in its slot [-, m]."""
-    joint_index: Int[Array, "5 joints"]
-    """Per joint: hash of its name, moves, first entry of q behind the base block, entries of q, present."""
+    joint_index: Int[Array, "9 joints"]
+    """Per joint: hash of its name, present, moves, first entry of q behind the base block, entries of q, the same two
+    of v, declared parent and child link."""
     joint_value: Float[Array, "joints 37"]
     """Per joint: rotation and position in the declared parent, three screws, lock values, lock quaternion."""
     dof_value: Float[Array, "3 nv"]

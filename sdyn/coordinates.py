@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from sdyn.chain import BASE_POSE, Chain
-from sdyn.rotation import conjugate, matrix
+from sdyn.rotation import conjugate, exp, matrix, normalised, product
 from sdyn.spatial import cross
 
 
@@ -75,33 +75,8 @@ def gravity_of(pose: Pose, gravity):
     return jnp.concatenate([jnp.zeros(3, pose.R.dtype), pose.R.T @ gravity])[:, None]
 
 
-def qdot(chain: Chain, q, v):
-    """The plain time derivative of q."""
-    nb, pose = chain.capacity.base_nq, pose_of(chain, q)
-    joints = v[chain.capacity.base_nv :]
-    out = jnp.zeros_like(q)
-    if chain.capacity.quaternions == 0:
-        out = out.at[nb : nb + joints.shape[0]].set(joints)
-    else:
-        at = jnp.where(chain.dof_to_q >= 0, nb + chain.dof_to_q, q.shape[0])
-        out = out.at[at].set(joints, mode="drop")
-        real = _quat_is_real(chain)[:, None]
-        quat = q[nb + chain.quat_index[0][:, None] + jnp.arange(4)]
-        rate = jnp.where(real, _quat_rate(quat.T, joints[_quat_dofs(chain)].T).T, 0)
-        out = out.at[nb + chain.quat_index[0][:, None] + jnp.arange(4)].add(rate)
-    if nb:
-        base = jnp.concatenate([pose.R @ v[3:6], _quat_rate(q[3:7], v[:3])])
-        out = out.at[:7].set(jnp.where(chain.free == 1, base, 0))
-    return out
-
-
-def _quat_rate(quat, w):
-    """q̇ = 1/2 q o [0; w], rates in body axes."""
-    return 0.5 * jnp.concatenate([-(quat[1:] * w).sum(0)[None], quat[0] * w + cross(quat[1:], w)])
-
-
 def _quat_is_real(chain):
-    """Whether a quaternion slot is used: the joint it belongs to moves."""
+    """Whether a quaternion is in use: the joint it belongs to moves."""
     return chain.quat_index[0] >= 0
 
 
@@ -125,3 +100,46 @@ def turned_columns(chain: Chain, pose: Pose, columns):
     if chain.capacity.quaternions == 0:
         return columns
     return jnp.stack([_turn(chain, pose, column, inward=False) for column in columns.T], 1)
+
+
+def retract(chain: Chain, q, xi):
+    """The configuration at the increment `xi`, laid out like v: rotation vectors in body axes, the base's
+    displacement in world axes; joints add."""
+    nb, nv = chain.capacity.base_nq, chain.capacity.base_nv
+    joints = xi[nv:]
+    if chain.capacity.quaternions == 0:
+        out = q.at[nb : nb + joints.shape[0]].add(joints)
+    else:
+        out = q.at[jnp.where(chain.dof_to_q >= 0, nb + chain.dof_to_q, q.shape[0])].add(joints, mode="drop")
+        places = nb + chain.quat_index[0][:, None] + jnp.arange(4)
+        real, quat = _quat_is_real(chain)[:, None], q[places]
+        new = jnp.where(real, _turned(quat.T, joints[_quat_dofs(chain)].T).T, quat)
+        out = out.at[jnp.where(real, places, q.shape[0])].set(new, mode="drop")
+    if nb:
+        base = jnp.concatenate([q[:3] + xi[3:6], _turned(q[3:7], xi[:3])])
+        out = out.at[:7].set(jnp.where(chain.free == 1, base, q[:7]))
+    return out
+
+
+def increment_rate(chain: Chain, q, xi, v):
+    """Time derivative of `xi` where `retract(q0, xi) = q` moves with v:
+    θ' = w + 1/2 θ x w + 1/12 θ x (θ x w), and the base's origin with R v."""
+    nv = chain.capacity.base_nv
+    out = v
+    if chain.capacity.quaternions:
+        dofs = nv + _quat_dofs(chain)
+        rate = _rotation_vector_rate(xi[dofs].T, v[dofs].T).T
+        out = out.at[dofs].add(jnp.where(_quat_is_real(chain)[:, None], rate - v[dofs], 0))
+    if nv:
+        base = jnp.concatenate([_rotation_vector_rate(xi[:3], v[:3]), pose_of(chain, q).R @ v[3:6]])
+        out = out.at[:6].set(base * chain.free)
+    return out
+
+
+def _turned(quat, theta):
+    """quat o exp(theta), normalised."""
+    return normalised(product(normalised(quat), exp(theta)))
+
+
+def _rotation_vector_rate(theta, w):
+    return w + cross(theta, w) / 2 + cross(theta, cross(theta, w)) / 12

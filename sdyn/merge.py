@@ -7,7 +7,7 @@ placements are traced. The index arrays say which links belong together; they co
 import numpy as np
 
 from sdyn.chain import (
-    FIRST, FORWARD, FROM, JOINT, JOINT_ROWS, LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_POINTER, LINK_SLOT, LIVE,
+    FIRST, FORWARD, FROM, JOINT, JOINT_ROWS, LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_PARENT, LINK_SLOT, LIVE,
     LOCK, LOCK_QUAT, PLACE_P, PLACE_R, SCREW, SCREWS, SIGN,
 )  # fmt: skip
 
@@ -81,7 +81,8 @@ def _link_poses(xp, link_index, joints):
     R, p = xp.where(at_slot[:, None, None], eye, R), xp.where(at_slot[:, None], none, p)
 
     R, p = xp.concatenate([R, eye[None]]), xp.concatenate([p, none])
-    pointer = xp.concatenate([link_index[LINK_POINTER], np.array([n], link_index.dtype)])
+    pointer = xp.where(fixed, link_index[LINK_PARENT], n)
+    pointer = xp.concatenate([pointer, np.array([n], link_index.dtype)])
     for _ in range(n.bit_length()):
         Rp, pp = R[pointer], p[pointer]
         R, p, pointer = Rp @ R, pp + _turn(Rp, p), pointer[pointer]

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 
 from sdyn.chain import (
-    DOF, FIRST, FORWARD, FROM, JOINT, JOINT_MOVES, JOINT_NAME, JOINT_NQ, JOINT_PRESENT, JOINT_Q, JOINT_ROWS,
-    LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_NAME, LINK_POINTER, LINK_SLOT, LIVE, LOCK, LOCK_QUAT, PARENT, QUAT,
-    SCREW, SCREWS, SIGN, Capacity, Chain, name_hash,
+    DOF, FIRST, FORWARD, FROM, JOINT, JOINT_CHILD, JOINT_DOF, JOINT_MOVES, JOINT_NAME, JOINT_NQ, JOINT_PARENT,
+    JOINT_PRESENT, JOINT_Q, JOINT_ROWS, JOINT_V, LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_NAME, LINK_PARENT,
+    LINK_SLOT, LIVE, LOCK, LOCK_QUAT, PARENT, QUAT, SCREW, SCREWS, SIGN, Capacity, Chain, name_hash,
 )  # fmt: skip
 from sdyn.checks import RobotError
 from sdyn.merge import derive
@@ -169,7 +169,7 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     _check_inertia(robot, parent, what, body)
     joint_at = {name: k for k, name in enumerate(capacity.joint_names)}
     link_at = {name: k for k, name in enumerate(capacity.link_names)}
-    joint_index, dof_value, dof_to_q, quats = _coordinates(robot, capacity, joint_at)
+    joint_index, dof_value, dof_to_q, quats = _coordinates(robot, capacity, joint_at, link_at)
     steps = schedule(parent, capacity.width)
     _check_fits(robot, capacity, len(steps), (int(joint_index[JOINT_NQ].sum()), len(parent), len(quats)))
 
@@ -210,21 +210,21 @@ def _check_inertia(robot, parent, what, body):
         raise RobotError(f"pack: the free robot has no mass at all; give link {robot.base!r} a mass, or ground it.")
 
 
-def _coordinates(robot, capacity, joint_at):
+def _coordinates(robot, capacity, joint_at, link_at):
     """joint_index, dof_value, dof_to_q, and {joint: (first of q, first of v, backwards)} of the quaternions."""
-    index = np.zeros((5, capacity.joints), np.int32)
+    index = np.zeros((9, capacity.joints), np.int32)
     index[JOINT_NAME] = [name_hash(name) for name in capacity.joint_names]
     values, to_q, quats, q, v = np.zeros((3, capacity.nv)), np.full(capacity.nv, -1, np.int32), {}, 0, 0
     for joint in robot.joints:
         k = joint_at[joint.name]
-        index[JOINT_PRESENT, k] = 1
+        index[JOINT_PRESENT, k], index[JOINT_PARENT, k], index[JOINT_CHILD, k] = 1, link_at[joint.parent], link_at[joint.child]
         if robot.is_locked(joint):
             continue
         if q + joint.nq <= capacity.nq and v + joint.dof <= capacity.nv:
             values[:, v : v + joint.dof] = np.array([[joint.damping, joint.stiffness, joint.rotor_inertia]]).T
             if joint.kind != "spherical":
                 to_q[v : v + joint.dof] = np.arange(q, q + joint.dof)
-        index[JOINT_MOVES, k], index[JOINT_Q, k], index[JOINT_NQ, k] = 1, q, joint.nq
+        index[[JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_V, JOINT_DOF], k] = 1, q, joint.nq, v, joint.dof
         if joint.kind == "spherical":
             i = robot.tree.joint.index(robot.joints.index(joint))
             quats[joint.name] = (q, v, int(not robot.tree.forward[i]))
@@ -261,7 +261,7 @@ def _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_in
 def _link_index(robot, capacity, body, slot, joint_at, link_at):
     index = np.zeros((6, capacity.links), np.int32)
     index[LINK_NAME] = [name_hash(name) for name in capacity.link_names]
-    index[LINK_SLOT], index[LINK_POINTER], index[LINK_JOINT] = capacity.slots + 1, capacity.links, capacity.joints
+    index[LINK_SLOT], index[LINK_PARENT], index[LINK_JOINT] = capacity.slots + 1, capacity.links, capacity.joints
     index[LINK_FORWARD] = 1
     for i, link in enumerate(robot.links):
         k, j = link_at[link.name], robot.tree.joint[i]
@@ -270,8 +270,8 @@ def _link_index(robot, capacity, body, slot, joint_at, link_at):
             continue
         joint = robot.joints[j]
         index[LINK_JOINT, k], index[LINK_FORWARD, k] = joint_at[joint.name], robot.tree.forward[i]
-        if robot.is_locked(joint):
-            index[LINK_FIXED, k], index[LINK_POINTER, k] = 1, link_at[robot.links[robot.tree.parent[i]].name]
+        index[LINK_PARENT, k] = link_at[robot.links[robot.tree.parent[i]].name]
+        index[LINK_FIXED, k] = robot.is_locked(joint)
     return index
 
 

@@ -1,0 +1,77 @@
+"""One step of fixed size on the manifold of configurations.
+
+The increment xi of a step lives in the tangent space at its start (`coordinates.retract`), so quaternions stay unit and
+RK4 keeps its order: θ' = w + 1/2 θ x w + 1/12 θ x (θ x w). Without the last term the order is 3.
+
+Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds (1999).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sdyn.chain import Chain
+from sdyn.coordinates import increment_rate, retract
+from sdyn.dynamics import forward_dynamics
+from sdyn.inputs import expect
+
+
+def integrate(
+    chain: Chain,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"],
+    dt,
+    *,
+    method: str = "rk4",
+    gravity: Float[Array, "3"] | None = None,
+    f_ext: Float[Array, "n 6"] | None = None,
+) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """The state after one step under constant forces.
+
+    Args:
+        chain: Packed structure.
+        q, v: State.
+        tau: Force, laid out as v [N m, N].
+        dt: Step [s]; may be traced, zero or negative.
+        method: "rk4" (order 4) or "semi_implicit" (order 1, one evaluation).
+        gravity: Acceleration of free fall, world axes [m/s^2].
+        f_ext: Wrenches on the links, as for `forward_dynamics`.
+
+    Returns:
+        q, v.
+
+    Raises:
+        ValueError: If the method is unknown, or a shape or type differs.
+    """
+    q, v, tau = expect(chain, q=q, v=v, tau=tau)
+    return step(chain, q, v, lambda t, q, v: tau, 0.0, dt, method=method, gravity=gravity, f_ext=f_ext)
+
+
+def step(chain, q, v, force, t, dt, *, method, gravity=None, f_ext=None):
+    """`integrate`, with the force as a function of time and state that every stage evaluates."""
+    dt = jnp.asarray(dt, chain.dtype)
+    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), gravity=gravity, f_ext=f_ext)
+    if method == "rk4":
+        return _rk4(chain, q, v, acceleration, t, dt)
+    if method == "semi_implicit":
+        v = v + dt * acceleration(t, q, v)
+        return retract(chain, q, dt * increment_rate(chain, q, jnp.zeros_like(v), v)), v
+    raise ValueError(f"integrate: there is no method {method!r}; the methods are 'rk4' and 'semi_implicit'.")
+
+
+def _rk4(chain, q0, v0, acceleration, t0, dt):
+    def slope(t, xi, v):
+        q = retract(chain, q0, xi)
+        return increment_rate(chain, q, xi, v), acceleration(t0 + t, q, v)
+
+    def stage(x, c):
+        """The slope at the fraction c of the step, reached along the slope x."""
+        return slope(c * dt, c * dt * x[0], v0 + c * dt * x[1])
+
+    rest = (jnp.zeros_like(v0), jnp.zeros_like(v0))
+    k1 = stage(rest, 0.0)
+    k2 = stage(k1, 0.5)
+    k3 = stage(k2, 0.5)
+    k4 = stage(k3, 1.0)
+    xi, dv = (sum(w * k[i] for w, k in zip((1 / 6, 1 / 3, 1 / 3, 1 / 6), (k1, k2, k3, k4), strict=True)) for i in range(2))
+    return retract(chain, q0, dt * xi), v0 + dt * dv

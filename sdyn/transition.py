@@ -1,0 +1,216 @@
+"""What happens to the state when the structure changes.
+
+Poses continue: every link keeps its pose, joints are matched by name, and `after` takes lock values, ground pose and
+the placement of new joints from the state. Velocities jump as in a plastic impact: v+ is the possible velocity that is
+nearest in kinetic energy,
+    M (v+ − v0) = Σ J_iᵀ I_i (V_i − J_i v0),
+with I_i, V_i the inertia and twist of each original link before, and v0 the base's twist and the joint rates before.
+Where the V_i are possible after the change (unlock, release, re-root) nothing jumps. Total momentum is kept where
+nothing is grounded, and kinetic energy never grows.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sdyn.chain import (
+    BASE_FREE, BASE_POSE, JOINT_CHILD, JOINT_DOF, JOINT_MOVES, JOINT_NAME, JOINT_NQ, JOINT_PARENT, JOINT_PRESENT,
+    JOINT_Q, JOINT_V, LINK_NAME, LINK_PARENT, LINK_SLOT, LOCK, PLACE_P, Chain,
+)  # fmt: skip
+from sdyn.coordinates import pose_of
+from sdyn.dynamics import solve_mass
+from sdyn.inputs import expect
+from sdyn.kinematics import jacobian_columns, link_motions, poses
+from sdyn.merge import placement
+from sdyn.momentum import link_momenta
+from sdyn.params import rederived
+from sdyn.rotation import from_matrix, normalised, product
+
+
+def transfer(before, after, q, v):
+    """The state of one variant, as the state of another variant of the same physical system.
+
+    Args:
+        before: Chain, or a tuple of chains that `after` attaches.
+        after: Chain, or a tuple of chains that come from a detach.
+        q, v: State of `before`; tuples if it is one.
+
+    Returns:
+        after: With lock values, ground pose and the placement of newly attached joints taken from the state; a new
+            joint that moves starts at zero.
+        q, v: State of `after`; tuples if it is one.
+        impulse: One impulsive wrench [n; f] per link of `after` [n, 6], the one that reaches it through the joint to
+            its parent in the tree (the base: through the ground), world axes, about the link's origin [N m s, N s].
+
+    Differentiable in everything, forward and reverse.
+
+    Source:
+        formulas.md, "Loops" and "Momentum and capture": the jump of a plastic impact, in coordinates that hold it.
+    """
+    if not isinstance(before, tuple):
+        before, q, v = (before,), (q,), (v,)
+    world = _World(*map(jnp.concatenate, zip(*map(_world, before, q, v), strict=True)))
+    if not isinstance(after, tuple):
+        return _arrive(world, after)
+    return tuple(zip(*(_arrive(world, chain) for chain in after), strict=True))
+
+
+class _World(NamedTuple):
+    """Links and joints before the change, of all chains."""
+
+    link: Float[Array, " n"]
+    """Hashes of the names, -1 where absent."""
+    R: Float[Array, "n 3 3"]
+    p: Float[Array, "n 3"]
+    """Pose of each link in the world."""
+    base: Float[Array, "n 4"]
+    turn: Float[Array, "n 3 3"]
+    """Quaternion of the base of its chain, and rotation of the link in it."""
+    V: Float[Array, "n 6"]
+    """Twist of each link about its own origin, world axes."""
+    joint: Float[Array, " joints"]
+    """Hashes of the names, -1 where absent; the last one is nobody's."""
+    value: Float[Array, "joints 7"]
+    """Coordinates as in the lock values of `Chain.joint_value`."""
+    rate: Float[Array, "joints 3"]
+
+
+def _world(chain: Chain, q, v) -> _World:
+    q, v = expect(chain, q=q, v=v)
+    pose = pose_of(chain, q)
+    R, p, V, _ = link_motions(chain, pose, v, jnp.zeros_like(v))
+    ground = chain.base_value[BASE_POSE + 3 :]
+    nb, nv = chain.capacity.base_nq, chain.capacity.base_nv
+    quat = normalised(jnp.where(chain.free == 1, q[3:7], ground) if nb else ground)
+    at_origin = jnp.concatenate([V[:, :3], V[:, 3:] + jnp.cross(V[:, :3], p)], 1)
+    world = (at_origin.reshape(-1, 2, 3) @ pose.R.T).reshape(-1, 6)
+    present = chain.link_index[LINK_SLOT] <= chain.capacity.slots
+    joint = chain.joint_index
+    none = jnp.full((1,), -1, joint.dtype)
+    pad = lambda x, like: jnp.concatenate([x, jnp.zeros((1, like), x.dtype)])
+    return _World(
+        jnp.where(present, chain.link_index[LINK_NAME], -1),
+        pose.R @ R,
+        pose.p + p @ pose.R.T,
+        jnp.broadcast_to(quat, (len(R), 4)),
+        R,
+        world,
+        jnp.concatenate([jnp.where(joint[JOINT_PRESENT] == 1, joint[JOINT_NAME], -1), none]),
+        pad(_values(chain, q[nb:]), 7),
+        pad(_gather(v[nv:], joint[JOINT_V], joint[JOINT_DOF], 3), 3),
+    )
+
+
+def _gather(x, start, count, width: int):
+    """Rows [joints, width] of x from `start` on, zero behind `count`."""
+    at = start[:, None] + jnp.arange(width)
+    x = jnp.concatenate([x, jnp.zeros(width, x.dtype)])
+    return jnp.where(jnp.arange(width) < count[:, None], x[jnp.where(at < len(x), at, 0)], 0)
+
+
+def _values(chain, q):
+    """Coordinates of all joints, moving ones from q and locked ones from their lock values."""
+    joint = chain.joint_index
+    x = _gather(q, joint[JOINT_Q], joint[JOINT_NQ], 4)
+    quat = (joint[JOINT_NQ] == 4)[:, None]
+    one = jnp.array([1.0, 0, 0, 0], q.dtype)
+    moving = jnp.concatenate([jnp.where(quat, 0, x[:, :3]), jnp.where(quat, x, one)], 1)
+    return jnp.where(joint[JOINT_MOVES][:, None] == 1, moving, chain.joint_value[:, LOCK:])
+
+
+def _arrive(world: _World, chain: Chain):
+    """The part of the world that is `chain`: (chain, q, v, impulse)."""
+    link = _match(chain.link_index[LINK_NAME], world.link)
+    joint = _match(chain.joint_index[JOINT_NAME], world.joint)
+    known = jnp.any(chain.joint_index[JOINT_NAME][:, None] == world.joint, 1)
+    R, p, V = (x[link] for x in (world.R, world.p, world.V))
+    R, p, V = _new_links(world, chain, R, p, V)
+    chain = _carry(chain, world.value[joint], known, R, p)
+
+    base = jnp.argmax((chain.link_index[LINK_SLOT] == chain.capacity.slots) & (chain.link_index[LINK_PARENT] == len(R)))
+    quat = product(world.base[link][base], from_matrix(world.turn[link][base]))
+    base_value = chain.base_value.at[BASE_POSE:].set(jnp.concatenate([p[base], quat]))
+    chain = replace(chain, base_value=base_value)
+
+    q, v = _state(chain, base_value[BASE_POSE:], R[base], V[base], world.rate[joint] * known[:, None])
+    v, impulse = _jump(chain, q, v, R, p, V)
+    return chain, q, v, impulse
+
+
+def _match(names, others):
+    """Numbers of the names among the others; 0 where a name is not there."""
+    return jnp.argmax(names[:, None] == others, 1)
+
+
+def _new_links(world, chain, R, p, V):
+    """A link that was nowhere before (a fixture) stands and moves with the link that its fixed joint mounts it on."""
+    known = jnp.any(chain.link_index[LINK_NAME][:, None] == world.link, 1)
+    parent, child = chain.joint_index[JOINT_PARENT], chain.joint_index[JOINT_CHILD]
+    present = chain.joint_index[JOINT_PRESENT] == 1
+    place_R, place_p = placement(chain.joint_value)
+    at = jnp.where(present & known[parent] & ~known[child], child, len(R))
+    arm = (R[parent] @ place_p[..., None])[..., 0]
+    turned = jnp.concatenate([V[parent][:, :3], V[parent][:, 3:] + jnp.cross(V[parent][:, :3], arm)], 1)
+    return tuple(
+        x.at[at].set(y, mode="drop") for x, y in ((R, R[parent] @ place_R), (p, p[parent] + arm), (V, turned))
+    )
+
+
+def _carry(chain, value, known, R, p):
+    """The chain with the lock values of the state, and new joints placed where their links are."""
+    parent, child = chain.joint_index[JOINT_PARENT], chain.joint_index[JOINT_CHILD]
+    back = jnp.swapaxes(R[parent], 1, 2)
+    there = jnp.concatenate([(back @ R[child]).reshape(-1, 9), (back @ (p[child] - p[parent])[..., None])[..., 0]], 1)
+    old = chain.joint_value
+    rows = jnp.concatenate([there, old[:, PLACE_P + 3 : LOCK], jnp.zeros_like(old[:, :3]), old[:, LOCK + 3 :]], 1)
+    rows = jnp.where(known[:, None], jnp.concatenate([old[:, :LOCK], value], 1), rows)
+    present = chain.joint_index[JOINT_PRESENT][:, None] == 1
+    return rederived(replace(chain, joint_value=jnp.where(present, rows, old)))
+
+
+def _state(chain, base_pose, R, V, rate):
+    """q after the change, and the guess v0 from the base's twist and the joint rates."""
+    joint, nb, nv = chain.joint_index, chain.capacity.base_nq, chain.capacity.base_nv
+    value = chain.joint_value[:, LOCK:]
+    value = jnp.where((joint[JOINT_NQ] == 4)[:, None], value[:, 3:], jnp.pad(value[:, :3], ((0, 0), (0, 1))))
+    q = jnp.zeros(chain.nq, value.dtype).at[_places(joint[JOINT_Q], joint[JOINT_NQ], 4, nb, chain.nq)].set(value, mode="drop")
+    v = jnp.zeros(chain.nv, value.dtype).at[_places(joint[JOINT_V], joint[JOINT_DOF], 3, nv, chain.nv)].set(rate, mode="drop")
+    if nb:
+        twist = jnp.concatenate([R.T @ V[:3], R.T @ V[3:]]) * chain.base_value[BASE_FREE]
+        q, v = q.at[:7].set(base_pose), v.at[:6].set(twist)
+    return q, v
+
+
+def _places(start, count, width: int, first: int, size: int):
+    """Where the entries of each joint go, `size` for those that go nowhere."""
+    at = first + start[:, None] + jnp.arange(width)
+    return jnp.where(jnp.arange(width) < count[:, None], at, size)
+
+
+def _jump(chain, q, v0, R, p, V):
+    """v after the impact, and the impulsive wrench that reaches each link."""
+    pose, index = pose_of(chain, q), chain.link_index
+    # twists before, about the base's origin and in its axes
+    w, u = V[:, :3], V[:, 3:] + jnp.cross(V[:, :3], pose.p - p)
+    V = jnp.concatenate([w @ pose.R, u @ pose.R], 1)
+    present = (index[LINK_SLOT] <= chain.capacity.slots)[:, None]
+    Rb, pb, V0, _ = link_motions(chain, pose, v0, jnp.zeros_like(v0))
+    _, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
+    J = jacobian_columns(chain, pose, S[..., 0], index[LINK_SLOT])
+    h = jnp.where(present, link_momenta(chain, Rb, pb, V - V0), 0)
+    dv = solve_mass(chain, q, jnp.einsum("nkv,nk->v", J, h))
+    dh = jnp.where(present, link_momenta(chain, Rb, pb, jnp.einsum("nkv,v->nk", J, dv)), 0) - h
+    total = _subtree_sums(index[LINK_PARENT], dh)
+    moment = total[:, :3] - jnp.cross(pb, total[:, 3:])
+    return v0 + dv, jnp.concatenate([moment @ pose.R.T, total[:, 3:] @ pose.R.T], 1)
+
+
+def _subtree_sums(parent, x):
+    """Sums over the subtrees, in log2(n) rounds: each round adds the links that are twice as far below."""
+    n = len(x)
+    x, pointer = jnp.concatenate([x, jnp.zeros((1, 6), x.dtype)]), jnp.append(parent, n)
+    for _ in range(n.bit_length()):
+        x, pointer = x.at[jnp.where(pointer < n, pointer, n + 1)].add(x, mode="drop"), pointer[pointer]
+    return x[:n]
