@@ -32,7 +32,7 @@ def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = 
             too small.
     """
     capacity = _capacity_of([robot], width or 1, padded=False) if capacity is None else capacity
-    return jax.device_put(_arrays(robot, capacity, jax.dtypes.canonicalize_dtype(dtype or float)))
+    return jax.device_put(_arrays(robot, capacity, _float_type(dtype)))
 
 
 def capacity(robots, *, width: int = 1) -> Capacity:
@@ -50,9 +50,9 @@ def capacity(robots, *, width: int = 1) -> Capacity:
 
 def family(robots, *, width: int = 1, dtype=None) -> Chain:
     """Robots packed to one capacity and stacked along a leading axis, for `vmap` over structures."""
-    robots, dtype = list(robots), jax.dtypes.canonicalize_dtype(dtype or float)
+    robots = list(robots)
     shared = capacity(robots, width=width)
-    chains = [_arrays(robot, shared, dtype) for robot in robots]
+    chains = [_arrays(robot, shared, _float_type(dtype)) for robot in robots]
     return jax.device_put(jax.tree.map(lambda *x: np.stack(x), *chains))
 
 
@@ -91,6 +91,17 @@ def _counts(chain, what):
     return bool(chain.free), int(np.asarray(chain.joint_index)[JOINT_NQ].sum()), int((np.asarray(chain.slot_index)[LIVE]).sum())
 
 
+def _float_type(dtype):
+    """The type asked for, or JAX's own default."""
+    found = jax.dtypes.canonicalize_dtype(dtype or float)
+    if dtype is not None and (found != np.dtype(dtype) or found.kind != "f"):
+        raise ValueError(
+            f"pack: the type {np.dtype(dtype)} is not to be had; use float32, or float64 after "
+            f"jax.config.update('jax_enable_x64', True)."
+        )
+    return found
+
+
 # ---- sizes -----------------------------------------------------------------------------------------------------------
 
 
@@ -118,24 +129,25 @@ def _sizes(robot, width):
     )
 
 
-def _check_fits(robot, capacity, steps, counts):
+def _check_fits(robot, capacity, needs):
+    """Refuse a robot whose names or sizes are not those of the capacity."""
+    again = "make the capacity with this robot in the list"
     for key, names in (("link", capacity.link_names), ("joint", capacity.joint_names), ("frame", capacity.frame_names)):
         mine = [part.name for part in getattr(robot, key + "s")]
-        unknown = set(mine) - set(names)
-        if unknown:
-            raise RobotError(f"pack: the capacity has no {key} {sorted(unknown)[0]!r}; make it with this robot in the list.")
-        if key == "joint" and sorted(mine, key=names.index) != mine:
-            raise RobotError("pack: the robot declares its joints in another order than the capacity does.")
+        at = {name: k for k, name in enumerate(names)}
+        for name in mine:
+            if name not in at:
+                raise RobotError(f"pack: the capacity has no {key} {name!r}; {again}.")
+        if key == "joint" and mine != sorted(mine, key=at.get):
+            raise RobotError("pack: the robot declares its joints in another order than the capacity; keep one order.")
         if len({name_hash(name) for name in names}) < len(names):
-            raise RobotError(f"pack: two {key} names have the same hash; rename one of {list(names)}.")
+            raise RobotError(f"pack: two {key}s have the same hash of their names, {list(names)}; rename one.")
     if capacity.layout != "padded" and (capacity.layout == "grounded") != robot.grounded:
         raise RobotError("pack: the capacity is the exact one of another robot; use sdyn.capacity([...]).")
-    for what, need, have in (
-        ("steps", steps, capacity.steps), ("entries of q", counts[0], capacity.nq),
-        ("entries of v", counts[1], capacity.nv), ("quaternions", counts[2], capacity.quaternions),
-    ):  # fmt: skip
-        if need > have:
-            raise RobotError(f"pack: the robot needs {need} {what} and the capacity has {have}; make it with this robot in the list.")
+    have = capacity.steps, capacity.nq, capacity.nv, capacity.quaternions
+    for what, need, room in zip(("steps", "entries of q", "entries of v", "quaternions"), needs, have, strict=True):
+        if need > room:
+            raise RobotError(f"pack: the robot needs {need} {what} and the capacity has {room}; {again}.")
 
 
 # ---- arrays ----------------------------------------------------------------------------------------------------------
@@ -165,13 +177,13 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     if robot.loops:
         names = [loop.name for loop in robot.loops]
         raise RobotError(f"pack: the robot has the loops {names}; closed chains are not supported yet, open() them.")
+    _check_fits(robot, capacity, _sizes(robot, capacity.width))
     parent, what, body = _bodies(robot)
     _check_inertia(robot, parent, what, body)
     joint_at = {name: k for k, name in enumerate(capacity.joint_names)}
     link_at = {name: k for k, name in enumerate(capacity.link_names)}
     joint_index, dof_value, dof_to_q, quats = _coordinates(robot, capacity, joint_at, link_at)
     steps = schedule(parent, capacity.width)
-    _check_fits(robot, capacity, len(steps), (int(joint_index[JOINT_NQ].sum()), len(parent), len(quats)))
 
     W, slots = capacity.width, capacity.slots
     slot = {b: t * W + w for t, step in enumerate(steps) for w, b in enumerate(step)} | {-1: slots}
@@ -220,10 +232,9 @@ def _coordinates(robot, capacity, joint_at, link_at):
         index[JOINT_PRESENT, k], index[JOINT_PARENT, k], index[JOINT_CHILD, k] = 1, link_at[joint.parent], link_at[joint.child]
         if robot.is_locked(joint):
             continue
-        if q + joint.nq <= capacity.nq and v + joint.dof <= capacity.nv:
-            values[:, v : v + joint.dof] = np.array([[joint.damping, joint.stiffness, joint.rotor_inertia]]).T
-            if joint.kind != "spherical":
-                to_q[v : v + joint.dof] = np.arange(q, q + joint.dof)
+        values[:, v : v + joint.dof] = np.array([[joint.damping, joint.stiffness, joint.rotor_inertia]]).T
+        if joint.kind != "spherical":
+            to_q[v : v + joint.dof] = np.arange(q, q + joint.dof)
         index[[JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_V, JOINT_DOF], k] = 1, q, joint.nq, v, joint.dof
         if joint.kind == "spherical":
             i = robot.tree.joint.index(robot.joints.index(joint))

@@ -15,6 +15,7 @@ import numpy as np
 
 from sdyn.checks import RobotError, array, distinct, known, number, pose, unit
 from sdyn.parts import KINDS, Frame, Joint, Link, Loop, Part, renamed
+from sdyn.posture import link_poses
 from sdyn.table import Table, table
 from sdyn.tree import Tree, span
 
@@ -333,15 +334,21 @@ class Robot(Part):
 
     # -- close loop ------------------------------------------------------------------------------------------------
 
-    def close(self, frame_a, frame_b, kind: str = "weld", name: str | None = None) -> "Robot":
-        """Join two frames by a weld, a point or a joint kind, so that they coincide.
+    def close(self, frame_a, frame_b, kind: str = "weld", name: str | None = None, q=None) -> "Robot":
+        """Join two frames by a weld, a point or a joint kind.
 
         Args:
             frame_a, frame_b: A frame's name, a `Frame`, or "ground".
             kind: weld, point, revolute, prismatic, universal, spherical, cylindrical or planar.
             name: Name of the loop; "frame_a_frame_b" if left out.
+            q: Configuration whose relative pose the frames keep; without it they coincide.
         """
         a, b = (self._end(x) for x in (frame_a, frame_b))
+        if q is not None:  # frame b moves to where frame a is
+            R, p = link_poses(self, q)
+            at = {link.name: (R[i], p[i]) for i, link in enumerate(self.links)} | {GROUND: (np.eye(3), np.zeros(3))}
+            (Ra, pa), (Rb, pb) = at[a.link], at[b.link]
+            b = replace(b, rotation=Rb.T @ Ra @ a.rotation, position=Rb.T @ (pa + Ra @ a.position - pb))
         return replace(self, loops=(*self.loops, Loop(name or f"{a.name}_{b.name}", a, b, kind)))
 
     def open(self, loop: str) -> "Robot":
