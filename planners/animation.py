@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from planners.motion import continuous, link_poses, quaternions
-from planners.shapes import ORANGE, robot_shapes
+from planners.motion import continuous, follow, quaternions, rotations
+from planners.shapes import ORANGE, extent, robot_shapes
 
 FRAMES_PER_SECOND = 25.0
 MAX_FRAMES = 1500  # of a long plan; what is slow looks smooth with fewer
 BACKGROUND = (10, 12, 20)
+VISIBLE = 2e-4  # m, and part of a quaternion: what moves less since it was last drawn is not drawn again
 
 
 def write(plan, path) -> None:
@@ -44,15 +45,13 @@ def frame_times(plan) -> np.ndarray:
 def tracks(plan, times: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The motion of every link at the given times: present [k], quaternions wxyz [k, 4], positions [k, 3] (m)."""
     out = {}
-    for phase, now in zip(plan.phases, _phase_masks(plan, times), strict=True):
-        bodies = [(phase.robot, phase.q), *([phase.passive[:2]] if phase.passive else [])]
-        for robot, q in bodies:
-            R, p = link_poses(robot, q)
-            for i, link in enumerate(robot.links):
+    for phase, now, pair in zip(plan.phases, _phase_masks(plan, times), follow(plan), strict=True):
+        for motion in filter(None, pair):
+            for i, link in enumerate(motion.robot.links):
                 new = (np.zeros(len(times), bool), np.zeros((len(times), 4)), np.zeros((len(times), 3)))
                 present, quaternion, position = out.setdefault(link.name, new)
                 present |= now
-                quaternion[now], position[now] = _at(times[now], phase.times, R[:, i], p[:, i])
+                quaternion[now], position[now] = _at(times[now], phase.times, motion.R[:, i], motion.p[:, i])
     return out
 
 
@@ -92,47 +91,87 @@ def _server():
 def _page(plan) -> str:
     times = frame_times(plan)
     motion = tracks(plan, times)
+    shapes = _shapes(plan)
+    parents = _parents(plan)
     with _server() as server:
-        _place_camera(server, motion)
-        nodes = _build(server.scene, plan, motion)
-        labels = _labels(server.scene, plan, motion)
+        low, high = _bounds(motion, shapes)
+        _place_camera(server.initial_camera, low, high)
+        nodes = _build(server.scene, shapes, parents)
+        labels = _labels(server.scene, plan, ((low + high) / 2)[:2], high[2])
         recorder = server.get_scene_serializer()
-        _play(recorder, times, motion, nodes, labels, _phase_masks(plan, times))
+        moves = {name: _seen_from(motion.get(parents[name]), motion[name]) for name in motion}
+        _play(recorder, times, moves, nodes, labels, _phase_masks(plan, times))
         page = recorder.as_html(dark_mode=True)
     return _with_heading(page, plan)
 
 
-def _place_camera(server, motion):
-    """Look at the scene's middle from aside and a little above, far enough to see all of it."""
-    paths = [p[present] for present, _, p in motion.values()]
-    low = np.min([p.min(axis=0) for p in paths], axis=0)
-    high = np.max([p.max(axis=0) for p in paths], axis=0)
-    middle = (low + high) / 2
-    reach = np.max([np.linalg.norm(p - middle, axis=1).max() for p in paths]) + 0.6
-    spread = (high - low) * [1.0, 1.0, 0.0]
-    aside = np.array([0.0, -1.0, 0.0]) if spread[0] >= spread[1] else np.array([1.0, 0.0, 0.0])
-    view = aside + np.array([0.35, 0.2, 0.45])
-    camera = server.initial_camera
-    camera.fov = np.radians(40.0)
-    camera.look_at = middle
-    camera.position = middle + reach / np.sin(camera.fov / 2) * view / np.linalg.norm(view)
-
-
-def _build(scene, plan, motion) -> dict:
-    """The solids, each under the node of its link; returns the nodes."""
-    scene.set_background_image(np.full((4, 4, 3), BACKGROUND, np.uint8), format="png")
+def _shapes(plan) -> dict:
+    """The solids of every link of the plan; the chaser's look wins over that of the compound."""
     shapes = {}
     for phase in plan.phases:
         shapes = {**robot_shapes(phase.robot), **shapes}
         if phase.passive:
             shapes |= robot_shapes(phase.passive[0], ORANGE, panels=True)
-    nodes = {}
-    for name, (present, quaternion, position) in motion.items():
-        place = {"wxyz": quaternion[0], "position": position[0], "visible": bool(present[0])}
-        nodes[name] = scene.add_frame(f"/{name}", show_axes=False, **place)
+    return shapes
+
+
+def _parents(plan) -> dict[str, str | None]:
+    """The link that each link hangs on in the scene: joints that rest then need no data. None: the world."""
+    parents = {}
+    for phase in plan.phases:
+        if phase.passive:
+            parents |= dict.fromkeys((link.name for link in phase.passive[0].links), None)
+    for phase in plan.phases:
+        robot = phase.robot
+        for link, p in zip(robot.links, robot.tree.parent, strict=True):
+            parents.setdefault(link.name, robot.links[p].name if p >= 0 and phase is plan.phases[0] else None)
+    return parents
+
+
+def _seen_from(parent, child):
+    """The motion of a link seen from another: present [k], quaternions [k, 4], positions [k, 3] (m)."""
+    if parent is None:
+        return child
+    present, (w, x, y, z), p = parent[0] & child[0], parent[1].T, parent[2]
+    inverse = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]).transpose(2, 0, 1)
+    R = rotations(parent[1])
+    return present, continuous((inverse @ child[1][..., None])[..., 0]), np.einsum("kji,kj->ki", R, child[2] - p)
+
+
+def _bounds(motion, shapes) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a box that holds all bodies at all times [m]."""
+    reach = {name: extent(shapes[name]) for name in motion}
+    low = np.min([p[present].min(axis=0) - reach[name] for name, (present, _, p) in motion.items()], axis=0)
+    high = np.max([p[present].max(axis=0) + reach[name] for name, (present, _, p) in motion.items()], axis=0)
+    return low, high
+
+
+def _place_camera(camera, low, high):
+    """Look at the middle of a box across its longer side, a little from above, and far enough to see all of it."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    aside = np.array([0.0, -1.0, 0.0]) if half[0] >= half[1] else np.array([1.0, 0.0, 0.0])
+    view = aside + np.array([0.35, 0.2, 0.45])
+    camera.fov = np.radians(40.0)
+    camera.look_at = middle
+    camera.position = middle + 0.65 * np.linalg.norm(half) / np.sin(camera.fov / 2) * view / np.linalg.norm(view)
+
+
+def _build(scene, shapes, parents) -> dict:
+    """The solids, each under the node of its link; returns the nodes."""
+    scene.set_background_image(np.full((4, 4, 3), BACKGROUND, np.uint8), format="png")
+    paths, nodes = {None: ""}, {}
+    for name in _outwards(parents):
+        paths[name] = f"{paths[parents[name]]}/{name}"
+        nodes[name] = scene.add_frame(paths[name], show_axes=False)
         for k, shape in enumerate(shapes[name]):
-            _add(scene, f"/{name}/{k}", shape)
+            _add(scene, f"{paths[name]}/{k}", shape)
     return nodes
+
+
+def _outwards(parents):
+    """The names, each after its parent."""
+    depth = lambda name: 0 if name is None else 1 + depth(parents[name])
+    return sorted(parents, key=depth)
 
 
 def _add(scene, name, shape):
@@ -148,13 +187,11 @@ def _add(scene, name, shape):
         scene.add_frame(name, axes_length=shape.size[0], axes_radius=0.06 * shape.size[0], **place)
 
 
-def _labels(scene, plan, motion) -> list:
+def _labels(scene, plan, middle, top) -> list:
     """A label for each phase, above the scene; it is shown in its phase only."""
-    paths = np.concatenate([p[present] for present, _, p in motion.values()])
-    place = {"position": (*((paths.min(0) + paths.max(0)) / 2)[:2], paths[:, 2].max() + 0.8)}
+    look = {"position": (*middle, top), "anchor": "top-center", "font_screen_scale": 1.5, "visible": False}
     spans = [f"{phase.name}, {phase.times[0]:.1f} to {phase.times[-1]:.1f} s" for phase in plan.phases]
-    look = {"anchor": "bottom-center", "font_screen_scale": 1.5, "visible": False}
-    return [scene.add_label(f"/phase {k}", text, **look, **place) for k, text in enumerate(spans)]
+    return [scene.add_label(f"/phase {k}", text, **look) for k, text in enumerate(spans)]
 
 
 def _play(recorder, times, motion, nodes, labels, masks):
@@ -173,8 +210,8 @@ def _play(recorder, times, motion, nodes, labels, masks):
         for name, (present, quaternion, position) in motion.items():
             put(nodes[name], "visible", bool(present[k]))
             if present[k]:
-                put(nodes[name], "wxyz", quaternion[k], 1e-6)
-                put(nodes[name], "position", position[k], 1e-6)
+                put(nodes[name], "wxyz", quaternion[k], VISIBLE)
+                put(nodes[name], "position", position[k], VISIBLE)
         recorder.insert_sleep(float(times[min(k + 1, len(times) - 1)] - times[k]))
 
 

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 import sdyn
-from planners.motion import body_momentum, continuous, frame_motion, momentum, quaternions
+from planners.motion import continuous, follow, quaternions
 
 BLUE, RED, GREEN, PURPLE, INK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#222222"  # Okabe and Ito's palette
 BANDS = ("#E8E8E8", "#DCEBF7", "#FCE9CF", "#DDF1E7", "#F4E3EE")
@@ -31,9 +31,10 @@ def draw(plan, folder) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     figures = {f"joint_{what}": joints(plan, what) for what in QUANTITIES}
-    figures |= {"base": base(plan), "momentum": momenta(plan)}
+    motions = follow(plan)
+    figures |= {"base": base(plan, motions), "momentum": momenta(plan, motions)}
     if plan.task.kind == "grasp":
-        figures["grasp"] = grasp(plan)
+        figures["grasp"] = grasp(plan, motions)
     paths = []
     for name, figure in figures.items():
         paths.append(folder / f"{name}.png")
@@ -116,13 +117,14 @@ def _limits(panel, values, pair):
 # -- base and momentum -------------------------------------------------------------------------------------------------
 
 
-def base(plan) -> Figure:
+def base(plan, motions) -> Figure:
     """Position, attitude and angular velocity of the base, against its start."""
     name = plan.phases[0].robot.base
     figure, panels = _sheet(plan, f"Motion of the base, {name!r}", 3, columns=1, height=2.0, lines="xyz")
     zero = None
-    for phase in plan.phases:
-        R, p, w = _base_motion(phase, name)
+    for phase, (robot, _) in zip(plan.phases, motions, strict=True):
+        R, p, twist = robot.of(sdyn.Frame("base", name))
+        w = np.einsum("kji,kj->ki", R, twist[:, :3])
         zero = zero or (R[0], p[0])
         for panel, values in zip(panels, (p - zero[1], rotation_vectors(zero[0].T @ R), w), strict=True):
             _components(panel, phase.times, values)
@@ -137,21 +139,15 @@ def base(plan) -> Figure:
     return figure
 
 
-def _base_motion(phase, name):
-    """Rotations [k, 3, 3], positions [k, 3] and angular velocities in own axes [k, 3] of a link."""
-    R, p, twist = frame_motion(phase.robot, phase.q, phase.v, sdyn.Frame("base", name))
-    return R, p, np.einsum("kji,kj->ki", R, twist[:, :3])
-
-
-def momenta(plan) -> Figure:
+def momenta(plan, motions) -> Figure:
     """Momentum of the chaser, of the target and of both, about the world's origin."""
-    capture = any(phase.passive for phase in plan.phases)
-    lines = {"chaser": BLUE, "target": RED, "total": INK} if capture else {"total": INK}
+    caught = {link.name for _, target in motions if target for link in target.robot.links}
+    lines = {"chaser": BLUE, "target": RED, "total": INK} if caught else {"total": INK}
     figure, panels = _sheet(
         plan, "Momentum, world axes, angular about the origin", 6, columns=3, height=2.3, lines=lines
     )
-    for phase in plan.phases:
-        for name, values in _shares(plan, phase).items():
+    for phase, pair in zip(plan.phases, motions, strict=True):
+        for name, values in shares(pair, caught).items():
             for panel, column in zip(panels, (3, 4, 5, 0, 1, 2), strict=True):
                 style = {"color": lines[name], "linewidth": 2.4 if name == "total" else 1.3}
                 panel.plot(phase.times, values[:, column], **style, alpha=0.6 if name == "total" else 1.0)
@@ -162,31 +158,33 @@ def momenta(plan) -> Figure:
     return figure
 
 
-def _shares(plan, phase) -> dict[str, np.ndarray]:
-    """Momentum [k, 6] of the chaser, of the target and in total; of a robot alone only the total."""
-    whole = momentum(phase.robot, phase.q, phase.v)
-    first = next((other.passive[0] for other in plan.phases if other.passive), None)
-    if first is None:
-        return {"total": whole}
-    link = first.link(first.base)
-    robot, q, v = phase.passive or (phase.robot, phase.q, phase.v)
-    target = body_momentum(link, *frame_motion(robot, q, v, sdyn.Frame("target", link.name)))
-    chaser = whole if phase.passive else whole - target
-    return {"chaser": chaser, "target": target, "total": chaser + target}
+def shares(pair, caught) -> dict[str, np.ndarray]:
+    """Momentum [k, 6] of the chaser, of the target and in total; of a robot alone only the total.
+
+    Args:
+        pair: Motion of the robot, and of the target as long as it is apart.
+        caught: Names of the target's links.
+    """
+    robot, target = pair
+    if not caught:
+        return {"total": robot.momentum()}
+    own = robot.momentum([link.name for link in robot.robot.links if link.name not in caught])
+    other = (target or robot).momentum(caught)
+    return {"chaser": own, "target": other, "total": own + other}
 
 
 # -- grasp -------------------------------------------------------------------------------------------------------------
 
 
-def grasp(plan) -> Figure:
+def grasp(plan, motions) -> Figure:
     """Distance, angle and relative velocity between the hand and the grasp frame, up to the grasp."""
     figure, panels = _sheet(
         plan, "Hand and grasp frame, until the grasp", 4, height=2.3, dashed="tolerance of tracking"
     )
     tolerance = plan.task.tolerance
     before = [phase for phase in plan.phases if phase.passive]
-    for phase in before:
-        for panel, values in zip(panels, separation(plan.task, phase), strict=True):
+    for phase, (robot, target) in zip(before, motions, strict=False):
+        for panel, values in zip(panels, separation(plan.task, robot, target), strict=True):
             panel.semilogy(phase.times, np.maximum(values, 1e-16), color=BLUE, linewidth=1.3)
     bounds = (tolerance.position, tolerance.angle, tolerance.speed, None)
     titles = ("Distance", "Angle", "Relative speed", "Relative angular speed")
@@ -202,12 +200,10 @@ def grasp(plan) -> Figure:
     return figure
 
 
-def separation(task, phase) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def separation(task, robot, target) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Between hand and target: distance [m], angle [rad], relative speed [m/s] and angular speed [rad/s], each [k]."""
-    robot, q, v = phase.passive
-    handle = next(x for x in robot.frames if x.name in (task.target.frame, f"target_{task.target.frame}"))
-    R_H, p_H, v_H = frame_motion(phase.robot, phase.q, phase.v, phase.robot.frame(task.robot.frame))
-    R_T, p_T, v_T = frame_motion(robot, q, v, handle)
+    R_H, p_H, v_H = robot.of(robot.robot.frame(task.robot.frame))
+    R_T, p_T, v_T = target.of(target.robot.frame(f"target_{task.target.frame}"))
     gap = p_T - p_H
     relative = v_T - v_H
     relative[:, 3:] -= np.cross(v_H[:, :3], gap)  # seen from the hand

@@ -1,7 +1,9 @@
-"""Where the bodies of a plan are, phase by phase: what the figures and the animation show."""
+"""Where the bodies of a plan are, phase by phase: what the figures and the animation show.
 
-from dataclasses import replace
-from functools import partial
+All structures of a plan are packed to one capacity, so that one program, compiled once, follows them all.
+"""
+
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -10,35 +12,75 @@ import numpy as np
 import sdyn
 
 
-def link_poses(robot: sdyn.Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of all links in the world along q [k, nq]: rotations [k, n, 3, 3], positions [k, n, 3] (m)."""
-    return _along(sdyn.body_poses, robot, q)
+@dataclass(frozen=True)
+class Motion:
+    """The motion of all links of a robot over k times, in world axes."""
+
+    robot: sdyn.Robot
+    R: np.ndarray
+    """Link to world, [k, n, 3, 3]."""
+    p: np.ndarray
+    """Origins, [k, n, 3] (m)."""
+    twist: np.ndarray
+    """Angular velocity, and velocity of the origin, [k, n, 6] (rad/s, m/s)."""
+
+    def of(self, frame: sdyn.Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotations [k, 3, 3], positions [k, 3] and twists [k, 6] of a frame."""
+        i = self._number(frame.link)
+        arm = self.R[:, i] @ frame.position
+        twist = self.twist[:, i].copy()
+        twist[:, 3:] += np.cross(twist[:, :3], arm)
+        return self.R[:, i] @ frame.rotation, self.p[:, i] + arm, twist
+
+    def momentum(self, links=None) -> np.ndarray:
+        """Momentum of some links (names), or of all, about the world's origin: [k, 6] (N m s, N s; angular first)."""
+        return sum(map(self._momentum, [link.name for link in self.robot.links] if links is None else links))
+
+    def _number(self, link):
+        return [x.name for x in self.robot.links].index(link)
+
+    def _momentum(self, name):
+        link = self.robot.link(name)
+        R, p, twist = self.of(sdyn.Frame("centre", name, position=link.com))
+        linear, w = link.mass * twist[:, 3:], twist[:, :3]
+        spin = np.einsum("kij,jl,kml,km->ki", R, link.inertia, R, w)
+        return np.hstack([spin + np.cross(p, linear), linear])
 
 
-def frame_motion(robot: sdyn.Robot, q: np.ndarray, v: np.ndarray, frame: sdyn.Frame):
-    """Motion of a frame along q [k, nq] and v [k, nv]; the robot need not have it.
-
-    Returns:
-        Rotations [k, 3, 3], positions [k, 3] (m), twists [k, 6] (rad/s, m/s; angular first, world axes).
-    """
-    marked, only = replace(robot, frames=(frame,)), (jnp.asarray(0),)
-    return *_along(sdyn.frame_pose, marked, q, fixed=only), _along(sdyn.frame_velocity, marked, q, v, fixed=only)
-
-
-def momentum(robot: sdyn.Robot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Total momentum along q and v, about the world's origin, world axes: [k, 6] (N m s, N s; angular first)."""
-    about_com = _along(sdyn.momentum, robot, q, v)
-    com = _along(sdyn.centre_of_mass, robot, q)
-    angular, linear = about_com[:, :3], about_com[:, 3:]
-    return np.hstack([angular + np.cross(com, linear), linear])
+def follow(plan) -> list[tuple[Motion, Motion | None]]:
+    """For each phase, the motion of its robot, and of the separate target if there is one."""
+    movers = [(phase.robot, phase.q, phase.v) for phase in plan.phases]
+    movers += [phase.passive for phase in plan.phases if phase.passive]
+    capacity = sdyn.capacity([_marked(robot) for robot, _, _ in movers])
+    room = max(len(q) for _, q, _ in movers)
+    motions = [_follow(robot, q, v, capacity, room) for robot, q, v in movers]
+    targets = iter(motions[len(plan.phases) :])
+    pairs = zip(plan.phases, motions, strict=False)
+    return [(motion, next(targets) if phase.passive else None) for phase, motion in pairs]
 
 
-def body_momentum(link: sdyn.Link, R: np.ndarray, p: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Momentum [k, 6] of one link about the world's origin, from the motion of its own origin (see `frame_motion`)."""
-    w, r = twist[:, :3], R @ link.com
-    linear = link.mass * (twist[:, 3:] + np.cross(w, r))
-    spin = np.einsum("kij,jl,kml,km->ki", R, link.inertia, R, w)
-    return np.hstack([spin + np.cross(p + r, linear), linear])
+def _marked(robot):
+    """The robot with one frame on each link, of the same name; nothing else of it is needed."""
+    return replace(robot, frames=tuple(sdyn.Frame(link.name, link.name) for link in robot.links), loops=())
+
+
+def _follow(robot, q, v, capacity, room) -> Motion:
+    chain = sdyn.pack(_marked(robot), capacity)
+    longer = lambda x: np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)])
+    names = list(capacity.frame_names)
+    rows = [names.index(link.name) for link in robot.links]
+    found = _motion(chain, *sdyn.pad(chain, longer(q), longer(v)), jnp.arange(len(names)))
+    return Motion(robot, *(np.asarray(x)[: len(q), rows] for x in found))
+
+
+@jax.jit
+def _motion(chain, q, v, frames):
+    """Poses and twists of frames along a path."""
+
+    def at(q, v, frame):
+        return *sdyn.frame_pose(chain, q, frame), sdyn.frame_velocity(chain, q, v, frame)
+
+    return jax.vmap(lambda q, v: jax.vmap(lambda frame: at(q, v, frame))(frames))(q, v)
 
 
 def quaternions(R: np.ndarray) -> np.ndarray:
@@ -59,20 +101,18 @@ def quaternions(R: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
+def rotations(q: np.ndarray) -> np.ndarray:
+    """Rotation matrices [k, 3, 3] of unit quaternions wxyz [k, 4]."""
+    w, x, y, z = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
 def continuous(q: np.ndarray) -> np.ndarray:
     """Quaternions [k, 4] with signs chosen so that neighbours are close."""
     flips = np.where((q[1:] * q[:-1]).sum(1) < 0.0, -1.0, 1.0)
     return q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-
-
-def _along(f, robot, *rows, fixed=()):
-    """`f(chain, *row, *fixed)` for every row, as NumPy arrays."""
-    size = len(rows[0])
-    room = 1 << (size - 1).bit_length()  # phases of different length share a compilation
-    padded = [np.concatenate([x, np.repeat(x[-1:], room - size, axis=0)]) for x in rows]
-    return jax.tree.map(lambda x: np.asarray(x)[:size], _mapped(f, sdyn.pack(robot), padded, fixed))
-
-
-@partial(jax.jit, static_argnums=0)
-def _mapped(f, chain, rows, fixed):
-    return jax.vmap(lambda row: f(chain, *row, *fixed))(rows)

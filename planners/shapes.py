@@ -36,7 +36,7 @@ def robot_shapes(robot: sdyn.Robot, body: tuple[int, int, int] = GREY, panels: b
     Args:
         robot: What to draw; locked joints need no care, since links stay links.
         body: Colour of the heavy links.
-        panels: Give the heavy links solar panels, which make a tumbling motion visible.
+        panels: Give the heavy links solar panels, which make a tumbling motion visible, unless they are long anyway.
     """
     total, radius = sum(link.mass for link in robot.links), _tube_radius(robot)
     arm = _arms(robot)
@@ -53,6 +53,11 @@ def robot_shapes(robot: sdyn.Robot, body: tuple[int, int, int] = GREY, panels: b
             Shape("axes", (3.0 * radius,), x.position, x.rotation) for x in robot.frames if x.link == link.name
         ]
     return shapes
+
+
+def extent(shapes: list[Shape]) -> float:
+    """Radius of a ball about the link's origin that holds all its shapes [m]."""
+    return max((np.linalg.norm(x.position) + np.linalg.norm(x.size) / 2 for x in shapes), default=0.0)
 
 
 def box_of(link: sdyn.Link) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +81,7 @@ def _tube_radius(robot) -> float:
     lengths = [np.linalg.norm(joint.position) for joint in robot.joints]
     lengths = [length for length in lengths[1:] if length > 1e-3]
     if not lengths:
-        return 0.05 * box_of(max(robot.links, key=lambda link: link.mass))[0].max()
+        return 0.03 * box_of(max(robot.links, key=lambda link: link.mass))[0].max()
     return min(0.28 * float(np.median(lengths)), 0.12 * max(lengths))
 
 
@@ -95,7 +100,7 @@ def _arms(robot) -> dict[str, int]:
 def _satellite(robot, link, color, panels, radius) -> list[Shape]:
     edges, axes = box_of(link)
     shapes = [Shape("box", tuple(edges), link.com, axes, color, None if panels else 0.55)]
-    if panels:
+    if panels and edges.max() < 3.0 * edges.min():
         long, mid = np.argsort(edges)[[2, 1]]
         size = np.full(3, 0.03 * edges.max())
         size[long], size[mid] = 1.2 * edges[long], 0.8 * edges[mid]

@@ -263,10 +263,11 @@ FILES = {
 }
 
 
-def _say(text):
-    console.print(Text(str(text)), soft_wrap=True)
+def _say(text, to: Console = console):
+    """One paragraph, wrapped on a terminal; whole lines for programs."""
+    to.print(Text(str(text)), soft_wrap=not to.is_terminal)
 
 
 def _fail(text, code: int = 1) -> int:
-    Console(stderr=True, highlight=False).print(Text(f"error: {text}"), soft_wrap=True)
+    _say(f"error: {text}", Console(stderr=True, highlight=False))
     return code

@@ -103,11 +103,12 @@ def _attach(robot, words, load):
     other = load(model)
     if prefix:
         other, other_frame = other.prefixed(prefix[0]), prefix[0] + other_frame
-    try:
-        return robot.attach(other, frame, other_frame)
-    except RobotError as error:
-        clash = " A fourth word is put before the other robot's names: attach MODEL FRAME OTHER_FRAME t_."
-        raise RobotError(f"{error}{clash if 'unique' in str(error) else ''}") from None
+    for parts in ("links", "joints", "frames", "loops"):
+        clash = {x.name for x in getattr(robot, parts)} & {x.name for x in getattr(other, parts)}
+        if clash:
+            name = min(clash)
+            raise RobotError(f"both have {parts} named {name!r}; add a prefix: attach {model} {frame} {words[2]} t_")
+    return robot.attach(other, frame, other_frame)
 
 
 def _detach(robot, joint):
