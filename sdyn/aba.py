@@ -19,19 +19,43 @@ import jax.numpy as jnp
 from jax import lax
 
 from sdyn.batching import Kernel
-from sdyn.chain import BASE_FREE
+from sdyn.chain import BaseRow
 from sdyn.materialise import keep
 from sdyn.rnea import rnea
-from sdyn.spatial import blocks_times, cat, dot, eye3, force_cross, hat, inertia_times, motion_cross, rigid_inertia, solve6
-from sdyn.sweep import add_to, base_inertia, batch_of, block, body_of, by_dof, by_step, place, poses_from, put
-from sdyn.sweep import steps_of, storage, take
+from sdyn.spatial import (
+    blocks_times,
+    cat,
+    dot,
+    eye3,
+    force_cross,
+    hat,
+    inertia_times,
+    motion_cross,
+    rigid_inertia,
+    solve6,
+)
+from sdyn.sweep import (
+    add_to,
+    base_inertia,
+    batch_of,
+    block,
+    body_of,
+    by_dof,
+    by_step,
+    place,
+    poses_from,
+    put,
+    steps_of,
+    storage,
+    take,
+)
 
 
 def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F):
     """Accelerations (a0 [6, B], qdd [nv, B]); the operands as in `rnea`."""
     W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F)
-    free = base_value[BASE_FREE]
+    free = base_value[BaseRow.FREE]
     V0 = V0 * free
 
     def bias(inertia, V, F):
@@ -63,7 +87,7 @@ def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, b0, b):
     """x of M x = b, as (x0 [6, B], x [nv, B])."""
     W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
     B = batch_of(slot_value, base_value, rotor, q, quat, b0, b)
-    free = base_value[BASE_FREE]
+    free = base_value[BaseRow.FREE]
 
     def outward(stored, x):
         R, p, S = place(x, keep(take(stored, x.parent)))

@@ -9,7 +9,7 @@ Derivatives are kernels too, made by AD of the kernel's function or by its own `
 `custom_vmap` (no reverse mode) and `linear_call` (no batching) cannot do this.
 """
 
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 
 import jax
 import jax.numpy as jnp
@@ -113,13 +113,15 @@ def _jvp(primals, tangents, *, kernel):
     if kernel.rule is not None:
         slopes = kernel.rule(primals, [t if g else None for t, g in zip(tangents, given, strict=True)], out)
     elif all(i in kernel.linear for i, g in enumerate(given) if g) and all(given[i] for i in kernel.linear):
-        slopes = _primitive.bind(*(t if g else p for p, t, g in zip(primals, tangents, given, strict=True)), kernel=kernel)
+        along = (t if g else p for p, t, g in zip(primals, tangents, given, strict=True))
+        slopes = _primitive.bind(*along, kernel=kernel)
     else:
-        slopes = _primitive.bind(*primals, *(t for t, g in zip(tangents, given, strict=True) if g), kernel=_tangent(kernel, given))
+        along = (t for t, g in zip(tangents, given, strict=True) if g)
+        slopes = _primitive.bind(*primals, *along, kernel=_tangent(kernel, given))
     return out, list(slopes)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _tangent(kernel, given) -> Kernel:
     """The kernel `(primals, tangents of the given ones) -> tangents of the outputs`, linear in the latter."""
     n = len(given)
@@ -146,7 +148,8 @@ def _transpose(cotangents, *operands, kernel):
     cotangents = [ad.instantiate_zeros(c) for c in cotangents]
     if kernel.transpose is not None:
         found = kernel.transpose([None if f else x for x, f in zip(operands, free, strict=True)], cotangents)
-        found = [_shared(c, operands[i].aval.shape) for i, c in zip([i for i, f in enumerate(free) if f], found, strict=True)]
+        shapes = [x.aval.shape for x, f in zip(operands, free, strict=True) if f]
+        found = [_shared(c, shape) for c, shape in zip(found, shapes, strict=True)]
     else:
         given = [x for x, f in zip(operands, free, strict=True) if not f]
         like = [jnp.zeros(x.aval.shape, x.aval.dtype) for x, f in zip(operands, free, strict=True) if f]
@@ -160,7 +163,7 @@ def _shared(cotangent, shape):
     return cotangent if cotangent.shape == shape else cotangent.sum(-1, keepdims=True)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _adjoint(kernel, free, outputs: int) -> Kernel:
     """The kernel `(other operands, zeros like the free ones, output cotangents) -> cotangents of the free ones`."""
     given = [i for i, f in enumerate(free) if not f]

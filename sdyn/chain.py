@@ -13,13 +13,41 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sdyn.checks import RobotError, known
 
-# rows of Chain.slot_index, .slot_value, .base_value, .link_index, .joint_index, .joint_value
-PARENT, DOF, QUAT, LIVE, JOINT, SCREW, SIGN, FORWARD, FIRST, FROM = range(10)
-C0, C1, C2, POINT, SLIDE, AXIS, MASS, COM, INERTIA, SLOT_ROWS = 0, 9, 18, 27, 30, 33, 39, 40, 43, 52
-BASE_FREE, BASE_POSE, BASE_ROWS = 13, 14, 21
-LINK_NAME, LINK_SLOT, LINK_PARENT, LINK_JOINT, LINK_FORWARD, LINK_FIXED = range(6)
-JOINT_NAME, JOINT_PRESENT, JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_V, JOINT_DOF, JOINT_PARENT, JOINT_CHILD = range(9)
-PLACE_R, PLACE_P, SCREWS, LOCK, LOCK_QUAT, JOINT_ROWS = 0, 9, 12, 30, 33, 37
+
+class SlotRow:
+    """Rows of `Chain.slot_index`."""
+
+    PARENT, DOF, QUAT, LIVE, JOINT, SCREW, SIGN, FORWARD, FIRST, FROM = range(10)
+
+
+class ValueRow:
+    """First rows of the parts of `Chain.slot_value`."""
+
+    C0, C1, C2, POINT, SLIDE, AXIS, MASS, COM, INERTIA = 0, 9, 18, 27, 30, 33, 39, 40, 43
+
+
+class BaseRow:
+    """First entries of the parts of `Chain.base_value`."""
+
+    MASS, COM, INERTIA, FREE, POSE = 0, 1, 4, 13, 14
+
+
+class LinkRow:
+    """Rows of `Chain.link_index`."""
+
+    NAME, SLOT, PARENT, JOINT, FORWARD, FIXED = range(6)
+
+
+class JointRow:
+    """Rows of `Chain.joint_index`."""
+
+    NAME, PRESENT, MOVES, Q, NQ, V, DOF, PARENT, CHILD = range(9)
+
+
+class JointValue:
+    """First columns of the parts of `Chain.joint_value`, and their number."""
+
+    ROTATION, POSITION, SCREWS, LOCK, LOCK_QUAT, SIZE = 0, 9, 12, 30, 33, 37
 
 
 @dataclass(frozen=True)
@@ -116,7 +144,7 @@ class Chain:
     @property
     def free(self):
         """1 if the base is free, 0 if it is grounded."""
-        return self.base_value[BASE_FREE]
+        return self.base_value[BaseRow.FREE]
 
     @property
     def nq(self) -> int:

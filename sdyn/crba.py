@@ -1,14 +1,14 @@
 """The mass matrix by composite bodies, in the base's frame: M_ij = S_j · Ic_i S_i for j that carries i.
 
-Source: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2; without transforms the walk along the ancestors
-becomes one masked product.
+Source: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2; without transforms the walk along the
+ancestors becomes one masked product.
 """
 
 import jax.numpy as jnp
 from jax import lax
 
 from sdyn.batching import Kernel
-from sdyn.chain import BASE_FREE, DOF, LIVE
+from sdyn.chain import BaseRow, SlotRow
 from sdyn.materialise import keep
 from sdyn.spatial import cat, hat, inertia_times, rigid_inertia
 from sdyn.sweep import add_to, base_inertia, batch_of, block, body_of, place, poses_from, put, steps_of, storage, take
@@ -41,14 +41,14 @@ def _crba(slot_index, ancestors, slot_value, base_value, rotor, q, quat):
     diagonal = jnp.eye(slots, dtype=S.dtype)[..., None]
     M = lower + jnp.swapaxes(lower, 0, 1) * (1 - diagonal)
 
-    live = slot_index[LIVE].reshape(slots)
-    dof = jnp.where(live == 1, slot_index[DOF].reshape(slots), nv)  # empty slots go to a row that is cut off
+    live = slot_index[SlotRow.LIVE].reshape(slots)
+    dof = jnp.where(live == 1, slot_index[SlotRow.DOF].reshape(slots), nv)  # empty slots go to a row that is cut off
     joints = jnp.zeros((nv + 1, nv + 1, B), S.dtype).at[dof[:, None], dof[None]].add(M)[:nv, :nv]
     joints = joints + jnp.eye(nv, dtype=S.dtype)[..., None] * rotor[:, None]
-    across = jnp.zeros((nv + 1, 6, B), S.dtype).at[dof].add(IS)[:nv] * base_value[BASE_FREE]
+    across = jnp.zeros((nv + 1, 6, B), S.dtype).at[dof].add(IS)[:nv] * base_value[BaseRow.FREE]
     Io, h, m = total[slots, 4:].reshape(3, 3, B), hat(total[slots, 1:4]), total[slots, 0]
     eye = jnp.eye(3, dtype=S.dtype)[..., None]
-    corner = cat([cat([Io, h], 1), cat([-h, m * eye], 1)]) * base_value[BASE_FREE]
+    corner = cat([cat([Io, h], 1), cat([-h, m * eye], 1)]) * base_value[BaseRow.FREE]
     return (cat([cat([corner, jnp.swapaxes(across, 0, 1)], 1), cat([across, joints], 1)]),)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sdyn import aba as _aba
-from sdyn.chain import LINK_SLOT, Chain
+from sdyn.chain import Chain, LinkRow
 from sdyn.coordinates import gravity_of, join, pose_of, rates_of, spin, turned_columns
 from sdyn.crba import crba
 from sdyn.inputs import expect
@@ -124,12 +124,12 @@ def _operands(chain, q, gravity, f_ext):
 
 
 def _wrenches(chain, pose, f_ext):
-    """Wrenches on the slots, base axes, about the base's origin: [Rᵀ n + x × Rᵀ f; Rᵀ f], summed over a slot's links."""
+    """Wrenches on the slots, base axes and origin: [Rᵀ n + x × Rᵀ f; Rᵀ f], summed over the links of a slot."""
     slots, _ = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
     _, x = link_poses(chain, slots[..., 0])
     n, f = f_ext[:, :3] @ pose.R, f_ext[:, 3:] @ pose.R
     F = jnp.concatenate([n + jnp.cross(x, f), f], 1)
-    return jnp.zeros((slots.shape[0], 6), F.dtype).at[chain.link_index[LINK_SLOT]].add(F)[..., None]
+    return jnp.zeros((slots.shape[0], 6), F.dtype).at[chain.link_index[LinkRow.SLOT]].add(F)[..., None]
 
 
 def _passive(chain, pose, qd):

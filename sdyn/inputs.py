@@ -27,7 +27,7 @@ def expect(chain: Chain, **arrays) -> tuple:
                 raise ValueError(f"{name} has shape {x.shape}; this structure needs {want} ({_layout(chain)}).")
             if jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != chain.dtype:
                 raise ValueError(
-                    f"{name} is {x.dtype} and the chain is {chain.dtype}; convert it, or use pack(..., dtype={x.dtype})."
+                    f"{name} is {x.dtype} and the chain is {chain.dtype}; convert it, or pack with dtype={x.dtype}."
                 )
             x = x.astype(chain.dtype)
         out.append(x)

@@ -73,5 +73,5 @@ def _rk4(chain, q0, v0, acceleration, t0, dt):
     k2 = stage(k1, 0.5)
     k3 = stage(k2, 0.5)
     k4 = stage(k3, 1.0)
-    xi, dv = (sum(w * k[i] for w, k in zip((1 / 6, 1 / 3, 1 / 3, 1 / 6), (k1, k2, k3, k4), strict=True)) for i in range(2))
+    xi, dv = ((k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) / 6 for i in range(2))
     return retract(chain, q0, dt * xi), v0 + dt * dv

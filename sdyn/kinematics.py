@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from sdyn.batching import Kernel
-from sdyn.chain import BASE_FREE, DOF, LINK_SLOT, LIVE, Chain, index_of
+from sdyn.chain import BaseRow, Chain, LinkRow, SlotRow, index_of
 from sdyn.coordinates import Pose, pose_of, rates_of, spin, turned_columns
 from sdyn.inputs import expect
 from sdyn.materialise import keep
@@ -60,21 +60,21 @@ def link_motions(chain: Chain, pose: Pose, v, vdot):
     value = chain.slot_value[..., None]
     V0, qd = rates_of(chain, pose, v)
     a0, qdd = rates_of(chain, pose, vdot)
-    free = chain.base_value[BASE_FREE]
+    free = chain.base_value[BaseRow.FREE]
     (slots,) = motions(chain.slot_index, value, pose.q, pose.quat, V0 * free, qd, a0 * free, qdd - spin(chain, qd))
     slots = slots[..., 0]
-    return *link_poses(chain, slots), *(slots[chain.link_index[LINK_SLOT], k : k + 6] for k in (12, 18))
+    return *link_poses(chain, slots), *(slots[chain.link_index[LinkRow.SLOT], k : k + 6] for k in (12, 18))
 
 
 def link_poses(chain: Chain, slots):
     """Rotation and origin of every link in base axes, from those of its slot."""
-    at = slots[chain.link_index[LINK_SLOT]]
+    at = slots[chain.link_index[LinkRow.SLOT]]
     R, p = at[:, :9].reshape(-1, 3, 3), at[:, 9:12]
     return R @ chain.link_pose[:, :9].reshape(-1, 3, 3), p + (R @ chain.link_pose[:, 9:, None])[..., 0]
 
 
 def frame_at(chain: Chain, frame):
-    """Number of a frame's link, and rotation and position of the frame in it; NaN if this structure has no such frame."""
+    """Number of a frame's link, and its rotation and position in it; NaN if this structure has no such frame."""
     index = index_of(frame, chain.capacity.frame_names, chain.frame_index[0], "frame")
     link, value = chain.frame_index[1][index], chain.frame_value[index]
     value = jnp.where(link >= 0, value, jnp.nan)
@@ -131,24 +131,24 @@ def frame_jacobian(chain: Chain, q: Float[Array, " nq"], frame) -> Float[Array, 
     R, p = link_poses(chain, slots[..., 0])
     link, _, pf = frame_at(chain, frame)
     point = p[link] + R[link] @ pf
-    J = jacobian_columns(chain, pose, S[..., 0], chain.link_index[LINK_SLOT][link])
+    J = jacobian_columns(chain, pose, S[..., 0], chain.link_index[LinkRow.SLOT][link])
     linear = J[3:] + jnp.cross(J[:3], point[:, None], axis=0)  # v + w x point
     return jnp.concatenate([pose.R @ J[:3], pose.R @ linear])
 
 
 def jacobian_columns(chain: Chain, pose: Pose, S, slot):
     """Twists [..., 6, nv] of slots (numbers of any shape) per unit of v, base axes and origin; `S` [slots, 6]."""
-    live = chain.slot_index[LIVE].reshape(-1) == 1
+    live = chain.slot_index[SlotRow.LIVE].reshape(-1) == 1
     n, nv = live.shape[0], chain.capacity.nv
     carries = jnp.where((slot < n)[..., None], chain.ancestors[jnp.minimum(slot, n - 1)], False)
-    dof = jnp.where(live, chain.slot_index[DOF].reshape(-1), nv)
+    dof = jnp.where(live, chain.slot_index[SlotRow.DOF].reshape(-1), nv)
     by_dof = jnp.zeros((nv + 1, n), S.dtype).at[dof, jnp.arange(n)].add(1)[:nv]
     J = jnp.einsum("...s,sk,vs->...kv", carries.astype(S.dtype), S, by_dof)
     if chain.capacity.quaternions:
         turn = jax.vmap(lambda columns: turned_columns(chain, pose, columns.T).T)
         J = turn(J.reshape(-1, 6, nv)).reshape(J.shape)
     if chain.capacity.base_nv:
-        present = (slot <= n)[..., None, None] * chain.base_value[BASE_FREE]
+        present = (slot <= n)[..., None, None] * chain.base_value[BaseRow.FREE]
         J = jnp.concatenate([jnp.eye(6, dtype=S.dtype) * present, J], -1)
     return J
 

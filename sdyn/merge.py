@@ -6,13 +6,10 @@ placements are traced. The index arrays say which links belong together; they co
 
 import numpy as np
 
-from sdyn.chain import (
-    FIRST, FORWARD, FROM, JOINT, JOINT_ROWS, LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_PARENT, LINK_SLOT, LIVE,
-    LOCK, LOCK_QUAT, PLACE_P, PLACE_R, SCREW, SCREWS, SIGN,
-)  # fmt: skip
+from sdyn.chain import JointValue, LinkRow, SlotRow
 
-STILL = np.zeros((1, JOINT_ROWS))  # the joint of a base or of an empty slot: identity placement, no screw
-STILL[:, [0, 4, 8, LOCK_QUAT]] = 1.0
+STILL = np.zeros((1, JointValue.SIZE))  # the joint of a base or of an empty slot: identity placement, no screw
+STILL[:, [0, 4, 8, JointValue.LOCK_QUAT]] = 1.0
 
 
 def derive(xp, slot_index, link_index, joint_value, mass, com, inertia):
@@ -30,10 +27,10 @@ def derive(xp, slot_index, link_index, joint_value, mass, com, inertia):
     index = slot_index.reshape(len(slot_index), -1)
     joints = xp.concatenate([joint_value, STILL.astype(joint_value.dtype)])
     R, p = _link_poses(xp, link_index, joints)
-    m, c, I = _bodies(xp, link_index[LINK_SLOT], steps * width, mass, com, inertia, R[:-1], p[:-1])
+    m, c, I = _bodies(xp, link_index[LinkRow.SLOT], steps * width, mass, com, inertia, R[:-1], p[:-1])
 
     # an empty slot has a frame, an axis and an inertia: 1/0 would be masked in value, but not in the gradient
-    live = index[LIVE] == 1
+    live = index[SlotRow.LIVE] == 1
     body = [xp.where(live, m[:-1], 1.0)[:, None], c[:-1]]
     body += [xp.where(live[:, None, None], I[:-1], np.eye(3, dtype=m.dtype)).reshape(-1, 9)]
     slot_value = xp.concatenate([*_joint_constants(xp, index, joints, R, p), *body], 1)
@@ -44,20 +41,21 @@ def derive(xp, slot_index, link_index, joint_value, mass, com, inertia):
 
 def placement(joints):
     """Rotation and position of joint frames in their declared parents."""
-    return joints[:, PLACE_R : PLACE_R + 9].reshape(-1, 3, 3), joints[:, PLACE_P : PLACE_P + 3]
+    R, p = joints[:, JointValue.ROTATION : JointValue.POSITION], joints[:, JointValue.POSITION : JointValue.SCREWS]
+    return R.reshape(-1, 3, 3), p
 
 
 def displacement(xp, joints):
     """exp(S1 q1) exp(S2 q2) exp(S3 q3) R(quat) of each joint at its lock value: rotation, position."""
-    screws = joints[:, SCREWS : SCREWS + 18].reshape(-1, 3, 6)
+    screws = joints[:, JointValue.SCREWS : JointValue.SCREWS + 18].reshape(-1, 3, 6)
     R, p = np.eye(3, dtype=joints.dtype), 0.0
     for k in range(3):
-        q = joints[:, LOCK + k]
+        q = joints[:, JointValue.LOCK + k]
         a, b = screws[:, k, :3], screws[:, k, 3:]
         p = p + _turn(R, b * q[:, None])
         c0, c1, c2 = _screw_rotation(xp, a)
         R = R @ (c0 + c1 * xp.cos(q)[:, None, None] + c2 * xp.sin(q)[:, None, None])
-    return R @ _quaternion_rotation(xp, joints[:, LOCK_QUAT : LOCK_QUAT + 4]), p
+    return R @ _quaternion_rotation(xp, joints[:, JointValue.LOCK_QUAT : JointValue.LOCK_QUAT + 4]), p
 
 
 def _link_poses(xp, link_index, joints):
@@ -67,8 +65,8 @@ def _link_poses(xp, link_index, joints):
     the pose of the link pointed to end at the slot (number n).
     """
     n = link_index.shape[1]
-    joint = joints[link_index[LINK_JOINT]]
-    forward, fixed = link_index[LINK_FORWARD] == 1, link_index[LINK_FIXED] == 1
+    joint = joints[link_index[LinkRow.JOINT]]
+    forward, fixed = link_index[LinkRow.FORWARD] == 1, link_index[LinkRow.FIXED] == 1
     eye, none = np.eye(3, dtype=joints.dtype), np.zeros((1, 3), joints.dtype)
 
     # x_parent = place (displace x_child); a moving joint traversed backwards keeps its placement behind the motion
@@ -81,7 +79,7 @@ def _link_poses(xp, link_index, joints):
     R, p = xp.where(at_slot[:, None, None], eye, R), xp.where(at_slot[:, None], none, p)
 
     R, p = xp.concatenate([R, eye[None]]), xp.concatenate([p, none])
-    pointer = xp.where(fixed, link_index[LINK_PARENT], n)
+    pointer = xp.where(fixed, link_index[LinkRow.PARENT], n)
     pointer = xp.concatenate([pointer, np.array([n], link_index.dtype)])
     for _ in range(n.bit_length()):
         Rp, pp = R[pointer], p[pointer]
@@ -102,17 +100,17 @@ def _bodies(xp, slot, slots, mass, com, inertia, R, p):
 
 
 def _joint_constants(xp, index, joints, R, p):
-    """C0, C1, C2, point, slide and axis of each slot, see `Chain.slot_value`."""
-    rows, eye = joints[index[JOINT]], np.eye(3, dtype=joints.dtype)
-    first, ahead = index[FIRST] == 1, (index[FIRST] == 1) & (index[FORWARD] == 1)
+    """C0, ValueRow.C1, ValueRow.C2, point, slide and axis of each slot, see `Chain.slot_value`."""
+    rows, eye = joints[index[SlotRow.JOINT]], np.eye(3, dtype=joints.dtype)
+    first, ahead = index[SlotRow.FIRST] == 1, (index[SlotRow.FIRST] == 1) & (index[SlotRow.FORWARD] == 1)
     place_R, place_p = placement(rows)
-    from_R, from_p = R[index[FROM]], p[index[FROM]]
+    from_R, from_p = R[index[SlotRow.FROM]], p[index[SlotRow.FROM]]
     put_R = xp.where(ahead[:, None, None], from_R @ place_R, xp.where(first[:, None, None], from_R, eye))
     put_p = xp.where(ahead[:, None], from_p + _turn(from_R, place_p), xp.where(first[:, None], from_p, 0.0))
 
-    screws = rows[:, SCREWS : SCREWS + 18].reshape(-1, 3, 6)
-    S = screws[np.arange(len(rows)), index[SCREW]] * index[SIGN][:, None].astype(rows.dtype)
-    S = xp.where((index[LIVE] == 1)[:, None], S, np.array([0, 0, 1, 0, 0, 0], rows.dtype))
+    screws = rows[:, JointValue.SCREWS : JointValue.SCREWS + 18].reshape(-1, 3, 6)
+    S = screws[np.arange(len(rows)), index[SlotRow.SCREW]] * index[SlotRow.SIGN][:, None].astype(rows.dtype)
+    S = xp.where((index[SlotRow.LIVE] == 1)[:, None], S, np.array([0, 0, 1, 0, 0, 0], rows.dtype))
     rotations = [(put_R @ C).reshape(-1, 9) for C in _screw_rotation(xp, S[:, :3])]
     return [*rotations, put_p, _turn(put_R, S[:, 3:]), S]
 

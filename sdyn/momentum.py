@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import BASE_FREE, LINK_SLOT, Chain
+from sdyn.chain import BaseRow, Chain, LinkRow
 from sdyn.coordinates import pose_of, rates_of
 from sdyn.dynamics import mass_matrix
 from sdyn.inputs import expect
@@ -73,7 +73,7 @@ def generalised_jacobian(chain: Chain, q: Float[Array, " nq"], frame) -> Float[A
         return J
     M = mass_matrix(chain, q)
     # a grounded base of the padded layout has no mass; its columns of J are zero
-    Mbb = M[:6, :6] + jnp.eye(6, dtype=M.dtype) * (1 - chain.base_value[BASE_FREE])
+    Mbb = M[:6, :6] + jnp.eye(6, dtype=M.dtype) * (1 - chain.base_value[BaseRow.FREE])
     return J[:, 6:] - J[:, :6] @ jnp.linalg.solve(Mbb, M[:6, 6:])
 
 
@@ -89,6 +89,6 @@ def link_momenta(chain: Chain, R, p, V):
 def _centre(chain, R, p):
     """Centre of mass in base axes."""
     x = p + (R @ chain.link_com[..., None])[..., 0]
-    present = chain.link_index[LINK_SLOT] <= chain.capacity.slots
+    present = chain.link_index[LinkRow.SLOT] <= chain.capacity.slots
     m = jnp.where(present, chain.link_mass, 0)
     return (m @ x) / m.sum()

@@ -3,11 +3,7 @@
 import jax
 import numpy as np
 
-from sdyn.chain import (
-    DOF, FIRST, FORWARD, FROM, JOINT, JOINT_CHILD, JOINT_DOF, JOINT_MOVES, JOINT_NAME, JOINT_NQ, JOINT_PARENT,
-    JOINT_PRESENT, JOINT_Q, JOINT_ROWS, JOINT_V, LINK_FIXED, LINK_FORWARD, LINK_JOINT, LINK_NAME, LINK_PARENT,
-    LINK_SLOT, LIVE, LOCK, LOCK_QUAT, PARENT, QUAT, SCREW, SCREWS, SIGN, Capacity, Chain, name_hash,
-)  # fmt: skip
+from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, SlotRow, name_hash
 from sdyn.checks import RobotError
 from sdyn.merge import derive
 from sdyn.robot import Robot
@@ -70,7 +66,7 @@ def pad(chain: Chain, q, v):
             raise ValueError(f"pad: {what} has {x.shape[-1]} entries; the robot has {want}.")
     lead, size = q.shape[:-1], chain.capacity
     if not base:
-        q = np.concatenate([np.broadcast_to(np.asarray(chain.base_value)[14:], (*lead, 7)), q], -1)
+        q = np.concatenate([np.broadcast_to(np.asarray(chain.base_value)[BaseRow.POSE :], (*lead, 7)), q], -1)
         v = np.concatenate([np.zeros((*lead, 6)), v], -1)
     fill = lambda x, n: np.concatenate([x, np.zeros((*lead, n - x.shape[-1]))], -1)
     return tuple(jax.device_put(fill(x, n).astype(chain.dtype)) for x, n in ((q, 7 + size.nq), (v, 6 + size.nv)))
@@ -88,7 +84,8 @@ def _counts(chain, what):
         raise ValueError(f"{what}: the chain has exact sizes already; this is for chains packed with a capacity.")
     if isinstance(chain.joint_index, jax.core.Tracer):
         raise ValueError(f"{what}: the chain is traced, so its sizes are not known; call {what} outside of jit.")
-    return bool(chain.free), int(np.asarray(chain.joint_index)[JOINT_NQ].sum()), int((np.asarray(chain.slot_index)[LIVE]).sum())
+    joints = np.asarray(chain.joint_index)
+    return bool(chain.free), int(joints[JointRow.NQ].sum()), int(joints[JointRow.DOF].sum())
 
 
 def _float_type(dtype):
@@ -225,17 +222,17 @@ def _check_inertia(robot, parent, what, body):
 def _coordinates(robot, capacity, joint_at, link_at):
     """joint_index, dof_value, dof_to_q, and {joint: (first of q, first of v, backwards)} of the quaternions."""
     index = np.zeros((9, capacity.joints), np.int32)
-    index[JOINT_NAME] = [name_hash(name) for name in capacity.joint_names]
+    index[JointRow.NAME] = [name_hash(name) for name in capacity.joint_names]
     values, to_q, quats, q, v = np.zeros((3, capacity.nv)), np.full(capacity.nv, -1, np.int32), {}, 0, 0
     for joint in robot.joints:
         k = joint_at[joint.name]
-        index[JOINT_PRESENT, k], index[JOINT_PARENT, k], index[JOINT_CHILD, k] = 1, link_at[joint.parent], link_at[joint.child]
+        index[[JointRow.PRESENT, JointRow.PARENT, JointRow.CHILD], k] = 1, link_at[joint.parent], link_at[joint.child]
         if robot.is_locked(joint):
             continue
         values[:, v : v + joint.dof] = np.array([[joint.damping, joint.stiffness, joint.rotor_inertia]]).T
         if joint.kind != "spherical":
             to_q[v : v + joint.dof] = np.arange(q, q + joint.dof)
-        index[[JOINT_MOVES, JOINT_Q, JOINT_NQ, JOINT_V, JOINT_DOF], k] = 1, q, joint.nq, v, joint.dof
+        index[[JointRow.MOVES, JointRow.Q, JointRow.NQ, JointRow.V, JointRow.DOF], k] = 1, q, joint.nq, v, joint.dof
         if joint.kind == "spherical":
             i = robot.tree.joint.index(robot.joints.index(joint))
             quats[joint.name] = (q, v, int(not robot.tree.forward[i]))
@@ -245,8 +242,9 @@ def _coordinates(robot, capacity, joint_at, link_at):
 
 def _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_index, quats):
     index = np.zeros((10, capacity.slots), np.int32)
-    index[PARENT], index[JOINT], index[FROM] = capacity.slots + 1, capacity.joints, capacity.links
-    index[QUAT], index[SIGN], index[FORWARD] = capacity.quaternions, 1, 1
+    row, size = SlotRow, capacity
+    index[row.PARENT], index[row.JOINT], index[row.FROM] = size.slots + 1, size.joints, size.links
+    index[row.QUAT], index[row.SIGN], index[row.FORWARD] = size.quaternions, 1, 1
     first_v, v = {}, 0
     for joint in robot.moving:
         first_v[joint.name] = v
@@ -257,12 +255,12 @@ def _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_in
         turned = joint.kind == "spherical"
         screw = k if ahead or turned else joint.dof - 1 - k  # traversed backwards, the screws come in reverse
         s = slot[b]
-        index[:, s] = 0
-        index[PARENT, s], index[LIVE, s], index[JOINT, s], index[SCREW, s] = slot[parent[b]], 1, joint_at[joint.name], screw
-        index[DOF, s], index[FORWARD, s], index[FIRST, s] = first_v[joint.name] + screw, ahead, k == 0
-        index[SIGN, s] = 1 if ahead or turned else -1
-        index[QUAT, s] = list(quats).index(joint.name) if turned and k == 0 else capacity.quaternions
-        index[FROM, s] = link_at[robot.links[robot.tree.parent[i]].name]
+        index[row.PARENT, s], index[row.DOF, s] = slot[parent[b]], first_v[joint.name] + screw
+        index[row.LIVE, s], index[row.FORWARD, s], index[row.FIRST, s] = 1, ahead, k == 0
+        index[row.JOINT, s], index[row.SCREW, s] = joint_at[joint.name], screw
+        index[row.SIGN, s] = 1 if ahead or turned else -1
+        index[row.QUAT, s] = list(quats).index(joint.name) if turned and k == 0 else size.quaternions
+        index[row.FROM, s] = link_at[robot.links[robot.tree.parent[i]].name]
         if parent[b] >= 0:
             ancestors[s] = ancestors[slot[parent[b]]]
         ancestors[s, s] = True
@@ -271,30 +269,31 @@ def _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_in
 
 def _link_index(robot, capacity, body, slot, joint_at, link_at):
     index = np.zeros((6, capacity.links), np.int32)
-    index[LINK_NAME] = [name_hash(name) for name in capacity.link_names]
-    index[LINK_SLOT], index[LINK_PARENT], index[LINK_JOINT] = capacity.slots + 1, capacity.links, capacity.joints
-    index[LINK_FORWARD] = 1
+    index[LinkRow.NAME] = [name_hash(name) for name in capacity.link_names]
+    index[LinkRow.SLOT], index[LinkRow.PARENT] = capacity.slots + 1, capacity.links
+    index[LinkRow.JOINT] = capacity.joints
+    index[LinkRow.FORWARD] = 1
     for i, link in enumerate(robot.links):
         k, j = link_at[link.name], robot.tree.joint[i]
-        index[LINK_SLOT, k] = slot[body[i]]
+        index[LinkRow.SLOT, k] = slot[body[i]]
         if j < 0:
             continue
         joint = robot.joints[j]
-        index[LINK_JOINT, k], index[LINK_FORWARD, k] = joint_at[joint.name], robot.tree.forward[i]
-        index[LINK_PARENT, k] = link_at[robot.links[robot.tree.parent[i]].name]
-        index[LINK_FIXED, k] = robot.is_locked(joint)
+        index[LinkRow.JOINT, k], index[LinkRow.FORWARD, k] = joint_at[joint.name], robot.tree.forward[i]
+        index[LinkRow.PARENT, k] = link_at[robot.links[robot.tree.parent[i]].name]
+        index[LinkRow.FIXED, k] = robot.is_locked(joint)
     return index
 
 
 def _joint_value(robot, capacity, joint_at):
-    values = np.zeros((capacity.joints, JOINT_ROWS))
-    values[:, [0, 4, 8, LOCK_QUAT]] = 1.0
+    values = np.zeros((capacity.joints, JointValue.SIZE))
+    values[:, [0, 4, 8, JointValue.LOCK_QUAT]] = 1.0
     for joint in robot.joints:
         row = values[joint_at[joint.name]]
         row[:9], row[9:12] = joint.rotation.ravel(), joint.position
-        row[SCREWS : SCREWS + 6 * joint.dof] = joint.screws.ravel()
+        row[JointValue.SCREWS : JointValue.SCREWS + 6 * joint.dof] = joint.screws.ravel()
         if joint.name in robot.locked:
-            lock = LOCK_QUAT if joint.kind == "spherical" else LOCK
+            lock = JointValue.LOCK_QUAT if joint.kind == "spherical" else JointValue.LOCK
             row[lock : lock + joint.nq] = robot.locked[joint.name]
     return values
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import BASE_FREE, LINK_SLOT, Chain, Params
+from sdyn.chain import BaseRow, Chain, LinkRow, Params
 from sdyn.coordinates import gravity_of, pose_of
 from sdyn.inputs import expect
 from sdyn.kinematics import jacobian_columns, link_motions, poses
@@ -31,7 +31,7 @@ def rederived(chain: Chain) -> Chain:
     """The chain with its slots, base and link poses derived anew from links, joints and lock values."""
     inertial = chain.link_mass, chain.link_com, chain.link_inertia
     value, base, link_pose = derive(jnp, chain.slot_index, chain.link_index, chain.joint_value, *inertial)
-    base_value = jnp.concatenate([base, chain.base_value[BASE_FREE:]])
+    base_value = jnp.concatenate([base, chain.base_value[BaseRow.FREE:]])
     return replace(chain, slot_value=value, base_value=base_value, link_pose=link_pose)
 
 
@@ -76,7 +76,7 @@ def regressor(
     wrench = jnp.concatenate([moment, force], 1)
 
     _, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
-    columns = jacobian_columns(chain, pose, S[..., 0], chain.link_index[LINK_SLOT])
+    columns = jacobian_columns(chain, pose, S[..., 0], chain.link_index[LinkRow.SLOT])
     return jnp.einsum("nkv,nkc->vnc", columns, wrench).reshape(chain.nv, -1)
 
 

@@ -11,11 +11,24 @@ import jax.numpy as jnp
 from jax import lax
 
 from sdyn.batching import Kernel
-from sdyn.chain import BASE_FREE
+from sdyn.chain import BaseRow
 from sdyn.materialise import keep
 from sdyn.spatial import cat, dot, force_cross, inertia_times, motion_cross, rigid_inertia
-from sdyn.sweep import add_to, base_inertia, batch_of, block, body_of, by_dof, by_step, place, poses_from, put
-from sdyn.sweep import steps_of, storage, take
+from sdyn.sweep import (
+    add_to,
+    base_inertia,
+    batch_of,
+    block,
+    body_of,
+    by_dof,
+    by_step,
+    place,
+    poses_from,
+    put,
+    steps_of,
+    storage,
+    take,
+)
 
 
 def _rnea(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F):
@@ -26,7 +39,7 @@ def _rnea(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G
     """
     W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F)
-    free = base_value[BASE_FREE]
+    free = base_value[BaseRow.FREE]
     A0 = a0 * free - G if G.shape[0] else a0 * free
     V0 = V0 * free
 
@@ -72,7 +85,7 @@ def _adjoint(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd
     """
     W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F, c0, c)
-    free, wrench = base_value[BASE_FREE], F.shape[0] > 0
+    free, wrench = base_value[BaseRow.FREE], F.shape[0] > 0
     V0, w0 = V0 * free, c0 * free
     A0 = a0 * free - G if G.shape[0] else a0 * free
 

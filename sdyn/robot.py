@@ -75,9 +75,8 @@ class Robot(Part):
         self.tree  # noqa: B018  (refuses cycles and loose links now, not later)
 
     def __eq__(self, other):
-        same = type(self) is type(other) and all(
-            getattr(self, f.name) == getattr(other, f.name) for f in fields(self) if f.name not in ("ground_pose", "locked")
-        )
+        plain = [f.name for f in fields(self) if f.name not in ("ground_pose", "locked")]
+        same = type(self) is type(other) and all(getattr(self, key) == getattr(other, key) for key in plain)
         return (
             same
             and all(map(np.array_equal, self.ground_pose, other.ground_pose))

@@ -19,7 +19,8 @@ def matrix(quat):
 
 def product(a, b):
     """Quaternion product a o b."""
-    return jnp.concatenate([(a[0] * b[0] - (a[1:] * b[1:]).sum(0))[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
+    real = a[0] * b[0] - (a[1:] * b[1:]).sum(0)
+    return jnp.concatenate([real[None], a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])])
 
 
 def conjugate(quat):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from sdyn.chain import AXIS, C0, C1, C2, COM, DOF, INERTIA, LIVE, MASS, PARENT, POINT, QUAT, SLIDE
+from sdyn.chain import SlotRow, ValueRow
 from sdyn.materialise import keep
 from sdyn.rotation import matrix
 from sdyn.spatial import cat, cross, mm, mv, rigid_inertia
@@ -42,21 +42,21 @@ def steps_of(slot_index, slot_value, q, quat) -> Steps:
     if quat.shape[0]:  # rotation of the spherical joint that starts in a slot, identity elsewhere
         one = jnp.broadcast_to(jnp.eye(3, dtype=quat.dtype)[..., None, None], (3, 3, 1, quat.shape[-1]))
         rotations = cat([matrix(jnp.swapaxes(quat, 0, 1)), one], 2)
-        R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[QUAT], axis=2), 2, 0))
-    return Steps(jnp.arange(T, dtype=jnp.int32), slot_index[PARENT], slot_value, sin, cos, qs, R)
+        R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[SlotRow.QUAT], axis=2), 2, 0))
+    return Steps(jnp.arange(T, dtype=jnp.int32), slot_index[SlotRow.PARENT], slot_value, sin, cos, qs, R)
 
 
 def by_step(slot_index, x):
     """Values of the degrees of freedom (nv, B), laid out by slot (T, W, B), zero in empty slots."""
     if x.shape[0] == 0:
         return jnp.zeros((*slot_index.shape[1:], x.shape[-1]), x.dtype)
-    return jnp.take(x, slot_index[DOF], axis=0) * slot_index[LIVE][..., None].astype(x.dtype)
+    return jnp.take(x, slot_index[SlotRow.DOF], axis=0) * slot_index[SlotRow.LIVE][..., None].astype(x.dtype)
 
 
 def by_dof(slot_index, x, nv: int):
     """The inverse of `by_step`: (T, W, B) -> (nv, B)."""
-    live = jnp.where(slot_index[LIVE][..., None] == 1, x, 0)
-    return jnp.zeros((nv, x.shape[-1]), x.dtype).at[slot_index[DOF]].add(live)[:nv]
+    live = jnp.where(slot_index[SlotRow.LIVE][..., None] == 1, x, 0)
+    return jnp.zeros((nv, x.shape[-1]), x.dtype).at[slot_index[SlotRow.DOF]].add(live)[:nv]
 
 
 def storage(slots: int, base):
@@ -101,19 +101,20 @@ def place(x: Steps, parent):
     """Rotation, position and motion subspace S of the bodies of a step, from their parents' poses."""
     c, W = x.value, x.value.shape[1]
     Rp, pp = parent[:9].reshape(3, 3, W, -1), parent[9:12]
-    local = c[C0:C1] + c[C1:C2] * x.cos + c[C2:POINT] * x.sin
+    local = c[ValueRow.C0:ValueRow.C1] + c[ValueRow.C1:ValueRow.C2] * x.cos + c[ValueRow.C2:ValueRow.POINT] * x.sin
     R = keep(mm(Rp, local.reshape(3, 3, W, -1)))
     if x.quat is not None:
         R = keep(mm(R, x.quat))
-    p = keep(pp + mv(Rp, c[POINT:SLIDE] + c[SLIDE:AXIS] * x.q))
-    a = mv(R, c[AXIS : AXIS + 3])
-    S = keep(cat([a, mv(R, c[AXIS + 3 : MASS]) + cross(p, a)]))
+    p = keep(pp + mv(Rp, c[ValueRow.POINT:ValueRow.SLIDE] + c[ValueRow.SLIDE:ValueRow.AXIS] * x.q))
+    a = mv(R, c[ValueRow.AXIS : ValueRow.AXIS + 3])
+    S = keep(cat([a, mv(R, c[ValueRow.AXIS + 3 : ValueRow.MASS]) + cross(p, a)]))
     return R, p, S
 
 
 def body_of(value):
     """Mass, centre and inertia of the bodies of a step."""
-    return value[MASS], value[COM:INERTIA], value[INERTIA:].reshape(3, 3, *value.shape[1:])
+    m, c, I = value[ValueRow.MASS], value[ValueRow.COM : ValueRow.INERTIA], value[ValueRow.INERTIA :]
+    return m, c, I.reshape(3, 3, *value.shape[1:])
 
 
 def base_of(base_value):

@@ -15,10 +15,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import (
-    BASE_FREE, BASE_POSE, JOINT_CHILD, JOINT_DOF, JOINT_MOVES, JOINT_NAME, JOINT_NQ, JOINT_PARENT, JOINT_PRESENT,
-    JOINT_Q, JOINT_V, LINK_NAME, LINK_PARENT, LINK_SLOT, LOCK, PLACE_P, Chain,
-)  # fmt: skip
+from sdyn.chain import BaseRow, Chain, JointRow, JointValue, LinkRow
 from sdyn.coordinates import pose_of
 from sdyn.dynamics import solve_mass
 from sdyn.inputs import expect
@@ -81,25 +78,25 @@ def _world(chain: Chain, q, v) -> _World:
     q, v = expect(chain, q=q, v=v)
     pose = pose_of(chain, q)
     R, p, V, _ = link_motions(chain, pose, v, jnp.zeros_like(v))
-    ground = chain.base_value[BASE_POSE + 3 :]
+    ground = chain.base_value[BaseRow.POSE + 3 :]
     nb, nv = chain.capacity.base_nq, chain.capacity.base_nv
     quat = normalised(jnp.where(chain.free == 1, q[3:7], ground) if nb else ground)
     at_origin = jnp.concatenate([V[:, :3], V[:, 3:] + jnp.cross(V[:, :3], p)], 1)
     world = (at_origin.reshape(-1, 2, 3) @ pose.R.T).reshape(-1, 6)
-    present = chain.link_index[LINK_SLOT] <= chain.capacity.slots
+    present = chain.link_index[LinkRow.SLOT] <= chain.capacity.slots
     joint = chain.joint_index
     none = jnp.full((1,), -1, joint.dtype)
     pad = lambda x, like: jnp.concatenate([x, jnp.zeros((1, like), x.dtype)])
     return _World(
-        jnp.where(present, chain.link_index[LINK_NAME], -1),
+        jnp.where(present, chain.link_index[LinkRow.NAME], -1),
         pose.R @ R,
         pose.p + p @ pose.R.T,
         jnp.broadcast_to(quat, (len(R), 4)),
         R,
         world,
-        jnp.concatenate([jnp.where(joint[JOINT_PRESENT] == 1, joint[JOINT_NAME], -1), none]),
+        jnp.concatenate([jnp.where(joint[JointRow.PRESENT] == 1, joint[JointRow.NAME], -1), none]),
         pad(_values(chain, q[nb:]), 7),
-        pad(_gather(v[nv:], joint[JOINT_V], joint[JOINT_DOF], 3), 3),
+        pad(_gather(v[nv:], joint[JointRow.V], joint[JointRow.DOF], 3), 3),
     )
 
 
@@ -113,28 +110,29 @@ def _gather(x, start, count, width: int):
 def _values(chain, q):
     """Coordinates of all joints, moving ones from q and locked ones from their lock values."""
     joint = chain.joint_index
-    x = _gather(q, joint[JOINT_Q], joint[JOINT_NQ], 4)
-    quat = (joint[JOINT_NQ] == 4)[:, None]
+    x = _gather(q, joint[JointRow.Q], joint[JointRow.NQ], 4)
+    quat = (joint[JointRow.NQ] == 4)[:, None]
     one = jnp.array([1.0, 0, 0, 0], q.dtype)
     moving = jnp.concatenate([jnp.where(quat, 0, x[:, :3]), jnp.where(quat, x, one)], 1)
-    return jnp.where(joint[JOINT_MOVES][:, None] == 1, moving, chain.joint_value[:, LOCK:])
+    return jnp.where(joint[JointRow.MOVES][:, None] == 1, moving, chain.joint_value[:, JointValue.LOCK:])
 
 
 def _arrive(world: _World, chain: Chain):
     """The part of the world that is `chain`: (chain, q, v, impulse)."""
-    link = _match(chain.link_index[LINK_NAME], world.link)
-    joint = _match(chain.joint_index[JOINT_NAME], world.joint)
-    known = jnp.any(chain.joint_index[JOINT_NAME][:, None] == world.joint, 1)
+    link = _match(chain.link_index[LinkRow.NAME], world.link)
+    joint = _match(chain.joint_index[JointRow.NAME], world.joint)
+    known = jnp.any(chain.joint_index[JointRow.NAME][:, None] == world.joint, 1)
     R, p, V = (x[link] for x in (world.R, world.p, world.V))
     R, p, V = _new_links(world, chain, R, p, V)
     chain = _carry(chain, world.value[joint], known, R, p)
 
-    base = jnp.argmax((chain.link_index[LINK_SLOT] == chain.capacity.slots) & (chain.link_index[LINK_PARENT] == len(R)))
+    slot, parent = chain.link_index[LinkRow.SLOT], chain.link_index[LinkRow.PARENT]
+    base = jnp.argmax((slot == chain.capacity.slots) & (parent == len(R)))
     quat = product(world.base[link][base], from_matrix(world.turn[link][base]))
-    base_value = chain.base_value.at[BASE_POSE:].set(jnp.concatenate([p[base], quat]))
+    base_value = chain.base_value.at[BaseRow.POSE:].set(jnp.concatenate([p[base], quat]))
     chain = replace(chain, base_value=base_value)
 
-    q, v = _state(chain, base_value[BASE_POSE:], R[base], V[base], world.rate[joint] * known[:, None])
+    q, v = _state(chain, base_value[BaseRow.POSE:], R[base], V[base], world.rate[joint] * known[:, None])
     v, impulse = _jump(chain, q, v, R, p, V)
     return chain, q, v, impulse
 
@@ -146,9 +144,9 @@ def _match(names, others):
 
 def _new_links(world, chain, R, p, V):
     """A link that was nowhere before (a fixture) stands and moves with the link that its fixed joint mounts it on."""
-    known = jnp.any(chain.link_index[LINK_NAME][:, None] == world.link, 1)
-    parent, child = chain.joint_index[JOINT_PARENT], chain.joint_index[JOINT_CHILD]
-    present = chain.joint_index[JOINT_PRESENT] == 1
+    known = jnp.any(chain.link_index[LinkRow.NAME][:, None] == world.link, 1)
+    parent, child = chain.joint_index[JointRow.PARENT], chain.joint_index[JointRow.CHILD]
+    present = chain.joint_index[JointRow.PRESENT] == 1
     place_R, place_p = placement(chain.joint_value)
     at = jnp.where(present & known[parent] & ~known[child], child, len(R))
     arm = (R[parent] @ place_p[..., None])[..., 0]
@@ -160,25 +158,28 @@ def _new_links(world, chain, R, p, V):
 
 def _carry(chain, value, known, R, p):
     """The chain with the lock values of the state, and new joints placed where their links are."""
-    parent, child = chain.joint_index[JOINT_PARENT], chain.joint_index[JOINT_CHILD]
+    parent, child = chain.joint_index[JointRow.PARENT], chain.joint_index[JointRow.CHILD]
     back = jnp.swapaxes(R[parent], 1, 2)
     there = jnp.concatenate([(back @ R[child]).reshape(-1, 9), (back @ (p[child] - p[parent])[..., None])[..., 0]], 1)
     old = chain.joint_value
-    rows = jnp.concatenate([there, old[:, PLACE_P + 3 : LOCK], jnp.zeros_like(old[:, :3]), old[:, LOCK + 3 :]], 1)
-    rows = jnp.where(known[:, None], jnp.concatenate([old[:, :LOCK], value], 1), rows)
-    present = chain.joint_index[JOINT_PRESENT][:, None] == 1
+    screws, quat = old[:, JointValue.SCREWS : JointValue.LOCK], old[:, JointValue.LOCK_QUAT :]
+    new = jnp.concatenate([there, screws, jnp.zeros_like(old[:, :3]), quat], 1)
+    rows = jnp.where(known[:, None], jnp.concatenate([old[:, : JointValue.LOCK], value], 1), new)
+    present = chain.joint_index[JointRow.PRESENT][:, None] == 1
     return rederived(replace(chain, joint_value=jnp.where(present, rows, old)))
 
 
 def _state(chain, base_pose, R, V, rate):
     """q after the change, and the guess v0 from the base's twist and the joint rates."""
     joint, nb, nv = chain.joint_index, chain.capacity.base_nq, chain.capacity.base_nv
-    value = chain.joint_value[:, LOCK:]
-    value = jnp.where((joint[JOINT_NQ] == 4)[:, None], value[:, 3:], jnp.pad(value[:, :3], ((0, 0), (0, 1))))
-    q = jnp.zeros(chain.nq, value.dtype).at[_places(joint[JOINT_Q], joint[JOINT_NQ], 4, nb, chain.nq)].set(value, mode="drop")
-    v = jnp.zeros(chain.nv, value.dtype).at[_places(joint[JOINT_V], joint[JOINT_DOF], 3, nv, chain.nv)].set(rate, mode="drop")
+    value = chain.joint_value[:, JointValue.LOCK:]
+    value = jnp.where((joint[JointRow.NQ] == 4)[:, None], value[:, 3:], jnp.pad(value[:, :3], ((0, 0), (0, 1))))
+    at_q = _places(joint[JointRow.Q], joint[JointRow.NQ], 4, nb, chain.nq)
+    at_v = _places(joint[JointRow.V], joint[JointRow.DOF], 3, nv, chain.nv)
+    q = jnp.zeros(chain.nq, value.dtype).at[at_q].set(value, mode="drop")
+    v = jnp.zeros(chain.nv, value.dtype).at[at_v].set(rate, mode="drop")
     if nb:
-        twist = jnp.concatenate([R.T @ V[:3], R.T @ V[3:]]) * chain.base_value[BASE_FREE]
+        twist = jnp.concatenate([R.T @ V[:3], R.T @ V[3:]]) * chain.base_value[BaseRow.FREE]
         q, v = q.at[:7].set(base_pose), v.at[:6].set(twist)
     return q, v
 
@@ -195,14 +196,14 @@ def _jump(chain, q, v0, R, p, V):
     # twists before, about the base's origin and in its axes
     w, u = V[:, :3], V[:, 3:] + jnp.cross(V[:, :3], pose.p - p)
     V = jnp.concatenate([w @ pose.R, u @ pose.R], 1)
-    present = (index[LINK_SLOT] <= chain.capacity.slots)[:, None]
+    present = (index[LinkRow.SLOT] <= chain.capacity.slots)[:, None]
     Rb, pb, V0, _ = link_motions(chain, pose, v0, jnp.zeros_like(v0))
     _, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
-    J = jacobian_columns(chain, pose, S[..., 0], index[LINK_SLOT])
+    J = jacobian_columns(chain, pose, S[..., 0], index[LinkRow.SLOT])
     h = jnp.where(present, link_momenta(chain, Rb, pb, V - V0), 0)
     dv = solve_mass(chain, q, jnp.einsum("nkv,nk->v", J, h))
     dh = jnp.where(present, link_momenta(chain, Rb, pb, jnp.einsum("nkv,v->nk", J, dv)), 0) - h
-    total = _subtree_sums(index[LINK_PARENT], dh)
+    total = _subtree_sums(index[LinkRow.PARENT], dh)
     moment = total[:, :3] - jnp.cross(pb, total[:, 3:])
     return v0 + dv, jnp.concatenate([moment @ pose.R.T, total[:, 3:] @ pose.R.T], 1)
 
