@@ -1,0 +1,21 @@
+"""The README's Python runs and prints what it says; its table of files is complete."""
+
+import pathlib
+import re
+
+ROOT = pathlib.Path(__file__).parents[1]
+TEXT = (ROOT / "README.md").read_text(encoding="utf8")
+
+
+def test_the_example_runs_and_compiles_once(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", TEXT, re.S)
+    exec(compile(code, "README.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == "1 compilation"
+    assert [int(line.split()[0]) for line in lines[-4:-1]] == [37, 9, 9]
+
+
+def test_every_file_it_names_exists():
+    for folder, cells in re.findall(r"\| file in `(\w+)/` \| content \|\n\|---\|---\|\n((?:\|.*\n)+)", TEXT):
+        for name in re.findall(r"`([\w./]+)`", "".join(row.split("|")[1] for row in cells.splitlines())):
+            assert (ROOT / folder / name).exists(), f"{folder}/{name}"
