@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.columns import Columns
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
@@ -118,8 +117,15 @@ def show(robot: RobotWord, edit: Annotated[str, arg(metavar="EDITS")] = "", out:
     else:
         robots, remarks = {before.name: before}, ()
     views = [_view(caption, shown) for caption, shown in robots.items()]
-    wide = sum(console.measure(view).maximum for view in views) + 4 <= console.width
-    console.print(Columns(views, padding=(0, 4)) if wide else Group(*views))
+    needed = max(console.measure(part).maximum for view in views for part in view[1:])
+    if len(views) * (needed + 4) <= console.width:  # side by side
+        grid = Table.grid(padding=(0, 4), expand=True)
+        for _ in views:
+            grid.add_column(ratio=1)
+        grid.add_row(*(Group(*view) for view in views))
+        console.print(grid)
+    else:
+        console.print(Group(*(part for view in views for part in view)))
     for remark in remarks:
         _say(remark)
     if out:
@@ -141,6 +147,8 @@ def check(what: RobotOrPlan) -> int:
 
     robot = _robot(what, allow_unphysical=True)
     _say(drawing.summary(robot))
+    if robot.source:
+        console.print(Text(" ".join(robot.source.split()), style="dim"))
     findings = doctor.examine(robot)
     if not findings:
         _say("Nothing is wrong with it.")
@@ -204,16 +212,16 @@ def _robot(name: str, **options):
         raise Failure(f"{error} Or give the path of a {' or '.join(FORMATS)} file.") from None
 
 
-def _view(caption, robot) -> Group:
+def _view(caption, robot) -> list:
     """Degrees of freedom, structure and connectivity table of a robot."""
-    table = Table(title=f"connectivity table, {caption}", title_justify="left", title_style="bold", box=None)
+    table = Table(box=None)
     rows = robot.table()
-    for title in (*(name.replace("_", "-") for name in rows[0]._fields), "name") if rows else ():
+    for title in ("link", "parent", "end-effector", "connect", "cflag", "name"):
         table.add_column(title, justify="left" if title == "name" else "right")
     for row, name in zip(rows, rows.names, strict=True):
         table.add_row(*map(str, row), Text(name))
     heading = Text(f"{caption}: {drawing.summary(robot)}" if caption != robot.name else drawing.summary(robot), "bold")
-    return Group(heading, "", drawing.tree(robot), "", table, "")
+    return [heading, "", drawing.tree(robot), "", table if rows else Text("no joints, no connectivity table"), ""]
 
 
 def _planners():

@@ -74,6 +74,12 @@ def test_show_before_and_after(capsys, tmp_path):
     assert (tmp_path / "new" / "structure.png").stat().st_size > 10_000
 
 
+def test_show_puts_tables_side_by_side_where_there_is_room(capsys, monkeypatch):
+    monkeypatch.setattr(cli.console, "_width", 140)
+    assert main(["show", "planar3", "--edit", "reroot hand"]) == 0
+    assert any(line.count("cflag") == 2 for line in capsys.readouterr().out.splitlines())
+
+
 def test_show_a_file(capsys, tmp_path):
     sdyn.save(sdyn.models.load("planar3"), tmp_path / "a.json")
     assert main(["show", str(tmp_path / "a.json")]) == 0
@@ -169,6 +175,11 @@ def test_bad_robots_are_one_sentence(command, name, content, word, tmp_path, cap
 def test_check_is_silent_about_a_sound_robot(capsys):
     assert main(["check", "deos7"]) == 0
     assert "Nothing is wrong" in capsys.readouterr().out
+
+
+def test_check_says_what_was_repaired_in_a_shipped_model(capsys):
+    assert main(["check", "ets7"]) == 0
+    assert "Repaired: the published principal moments" in " ".join(capsys.readouterr().out.split())
 
 
 def test_check_names_an_impossible_inertia_and_its_repair(tmp_path, capsys):
