@@ -1,0 +1,24 @@
+"""Every notebook runs from top to bottom and prints what is kept in it, numbers of rounding size aside."""
+
+import pathlib
+import re
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((pathlib.Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+def printed(notebook):
+    cells = (cell for cell in notebook.cells if cell.cell_type == "code")
+    text = "".join(output.get("text", "") for cell in cells for output in cell.outputs if output.get("name") == "stdout")
+    return re.sub(r"\d\.?\d*e-1\d", "tiny", text)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs_and_prints_what_it_shows(path):
+    kept = nbformat.read(path, as_version=4)
+    fresh = nbformat.read(path, as_version=4)
+    NotebookClient(fresh, timeout=300, kernel_name="python3").execute()
+    assert printed(fresh) == printed(kept)
