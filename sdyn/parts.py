@@ -5,6 +5,7 @@ A joint of any kind is a short sequence of screws `exp([a; b] q)`, or a unit qua
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -178,17 +179,17 @@ class Joint(Part):
         """Entries of q."""
         return KINDS[self.kind].nq
 
-    @property
+    @cached_property
     def screws(self) -> np.ndarray:
         """Rows `[a; b]`, one per degree of freedom, in the joint frame; for spherical joints the child's axes."""
         a, o = self.axis, np.zeros(3)
         x, y = triad(a)
-        turn, slide = lambda e: np.r_[e, o], lambda e: np.r_[o, e]
+        turn, slide = lambda e: np.concatenate([e, o]), lambda e: np.concatenate([o, e])
         rows = {
             "fixed": [],
             "revolute": [turn(a)],
             "prismatic": [slide(a)],
-            "helical": [np.r_[a, self.pitch * a]],
+            "helical": [np.concatenate([a, self.pitch * a])],
             "cylindrical": [slide(a), turn(a)],
             "universal": [turn(a), turn(x)],
             "planar": [slide(x), slide(y), turn(a)],
