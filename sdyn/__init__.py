@@ -18,7 +18,7 @@ from sdyn.pack import capacity, family, pack, pad, unpad
 from sdyn.kinematics import body_poses, frame_acceleration, frame_jacobian, frame_pose, frame_velocity
 from sdyn.dynamics import bias_force, forward_dynamics, inverse_dynamics, mass_matrix, solve_mass
 from sdyn.momentum import centre_of_mass, generalised_jacobian, kinetic_energy, momentum
-from sdyn.params import params, regressor, with_params
+from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
 from sdyn.integrate import integrate
 from sdyn.rollout import rollout

@@ -1,11 +1,11 @@
-"""Inertial parameters of the original links: read them, replace them, and the equations of motion linear in them."""
+"""Parameters of a chain: inertias of the original links and lock values, and the equations linear in the former."""
 
 from dataclasses import replace
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import BaseRow, Chain, LinkRow, Params
+from sdyn.chain import BaseRow, Chain, JointRow, JointValue, LinkRow, Params, index_of
 from sdyn.coordinates import gravity_of, pose_of
 from sdyn.inputs import expect
 from sdyn.kinematics import jacobian_columns, link_motions, poses
@@ -25,6 +25,25 @@ def with_params(chain: Chain, params: Params) -> Chain:
         params: One entry for each original link, locked ones included. Physical consistency is the caller's.
     """
     return rederived(replace(chain, link_mass=params.mass, link_com=params.com, link_inertia=params.inertia))
+
+
+def with_locks(chain: Chain, values: dict) -> Chain:
+    """The chain with other values of locked joints; differentiable, and compiles nothing new.
+
+    Args:
+        chain: Packed structure.
+        values: {name of a locked joint: value}, in the units of q; values may be traced [m, rad, quaternion wxyz].
+
+    Raises:
+        RobotError: If there is no such joint. The value of a joint that moves has no effect.
+    """
+    rows = chain.joint_value
+    for name, value in values.items():
+        index = index_of(name, chain.capacity.joint_names, chain.joint_index[JointRow.NAME], "joint")
+        value = jnp.atleast_1d(jnp.asarray(value, chain.dtype))
+        first = JointValue.LOCK_QUAT if value.shape == (4,) else JointValue.LOCK
+        rows = rows.at[index, first : first + len(value)].set(value)
+    return rederived(replace(chain, joint_value=rows))
 
 
 def rederived(chain: Chain) -> Chain:
