@@ -42,12 +42,14 @@ from sdyn.sweep import (
     body_of,
     by_dof,
     by_step,
+    move,
     place,
     poses_from,
     put,
     steps_of,
     storage,
     take,
+    wrenches_of,
 )
 
 
@@ -65,19 +67,17 @@ def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G,
     def outward(stored, x):
         x, qd, F = x
         parent = keep(take(stored, x.parent))
-        R, p, S = place(x, parent)
-        Sqd = keep(S * qd)
-        V = keep(parent[12:18] + Sqd)
+        R, p, S, Sqd, V = move(x, parent, qd)
         inertia = keep(rigid_inertia(R, p, *body_of(x.value)))
         c = keep(motion_cross(V, Sqd))
         return put(stored, x.t, W, cat([R.reshape(9, W, -1), p, V])), (S, inertia, bias(inertia, V, F), c)
 
     steps = steps_of(slot_index, slot_value, q, quat)
-    by_slot = F[:slots].reshape(-1, W, 6, F.shape[-1]).swapaxes(1, 2) if F.shape[0] else None
+    by_slot, on_base = wrenches_of(slot_index, F)
     stored = poses_from(slots, B, slot_value.dtype, V0)
     _, bodies = lax.scan(outward, stored, (steps, by_step(slot_index, qd), by_slot))
     base = base_inertia(base_value)
-    pA0 = bias(base, V0[:, None], F[slots][:, None] if F.shape[0] else None)[:, 0] - f0 * free
+    pA0 = bias(base, V0[:, None], on_base)[:, 0] - f0 * free
     start = -G * (1 - free) if G.shape[0] else None
     a0, qdd = _solve(slot_index, steps, bodies, base, pA0, by_step(slot_index, tau), rotor, free, start, B)
     return (a0 + G if G.shape[0] else a0) * free, qdd

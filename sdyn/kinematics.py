@@ -15,8 +15,8 @@ from sdyn.chain import BaseRow, Chain, LinkRow, SlotRow, index_of
 from sdyn.coordinates import Pose, pose_of, rates_of, spin, turned_columns
 from sdyn.inputs import expect
 from sdyn.materialise import keep
-from sdyn.spatial import cat, motion_cross
-from sdyn.sweep import batch_of, by_step, place, poses_from, put, steps_of, take
+from sdyn.spatial import cat
+from sdyn.sweep import accelerated, batch_of, by_step, move, place, poses_from, put, steps_of, take
 
 
 def _poses(slot_index, slot_value, q, quat):
@@ -41,10 +41,8 @@ def _motions(slot_index, slot_value, q, quat, V0, qd, A0, qdd):
     def outward(stored, x):
         x, qd, qdd = x
         parent = keep(take(stored, x.parent))
-        R, p, S = place(x, parent)
-        Sqd = keep(S * qd)
-        V = keep(parent[12:18] + Sqd)
-        A = keep(parent[18:24] + S * qdd + motion_cross(V, Sqd))
+        R, p, S, Sqd, V = move(x, parent, qd)
+        A = accelerated(parent, S, qdd, V, Sqd)
         return put(stored, x.t, W, cat([R.reshape(9, W, -1), p, V, A])), None
 
     steps = steps_of(slot_index, slot_value, q, quat), by_step(slot_index, qd), by_step(slot_index, qdd)

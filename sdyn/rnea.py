@@ -15,6 +15,7 @@ from sdyn.chain import BaseRow
 from sdyn.materialise import keep
 from sdyn.spatial import cat, dot, force_cross, inertia_times, motion_cross, rigid_inertia
 from sdyn.sweep import (
+    accelerated,
     add_to,
     base_inertia,
     batch_of,
@@ -22,12 +23,13 @@ from sdyn.sweep import (
     body_of,
     by_dof,
     by_step,
-    place,
+    move,
     poses_from,
     put,
     steps_of,
     storage,
     take,
+    wrenches_of,
 )
 
 
@@ -50,10 +52,8 @@ def _rnea(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G
     def outward(stored, x):
         x, qd, qdd, F = x
         parent = keep(take(stored, x.parent))
-        R, p, S = place(x, parent)
-        Sqd = keep(S * qd)
-        V = keep(parent[12:18] + Sqd)
-        A = keep(parent[18:24] + S * qdd + motion_cross(V, Sqd))
+        R, p, S, Sqd, V = move(x, parent, qd)
+        A = accelerated(parent, S, qdd, V, Sqd)
         f = keep(force(*keep(rigid_inertia(R, p, *body_of(x.value))), V, A, F))
         return put(stored, x.t, W, cat([R.reshape(9, W, -1), p, V, A])), (S, f)
 
@@ -63,10 +63,10 @@ def _rnea(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G
         return add_to(stored, parent, f), dot(S, f)
 
     steps = steps_of(slot_index, slot_value, q, quat)
-    by_slot = F[:slots].reshape(-1, W, 6, F.shape[-1]).swapaxes(1, 2) if F.shape[0] else None
+    by_slot, on_base = wrenches_of(slot_index, F)
     stored = poses_from(slots, B, slot_value.dtype, V0, A0)
     _, forces = lax.scan(outward, stored, (steps, by_step(slot_index, qd), by_step(slot_index, qdd), by_slot))
-    at_base = force(*base_inertia(base_value), V0[:, None], A0[:, None], F[slots][:, None] if F.shape[0] else None)
+    at_base = force(*base_inertia(base_value), V0[:, None], A0[:, None], on_base)
     start = storage(slots, jnp.broadcast_to(at_base[:, 0], (6, B)))
     total, tau = lax.scan(inward, start, ((steps.t, steps.parent), forces), reverse=True)
     return total[slots] * free, by_dof(slot_index, tau, rotor.shape[0]) + rotor * qdd
@@ -99,10 +99,8 @@ def _adjoint(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd
     def outward(stored, x):
         x, qd, qdd, c, F = x
         parent = keep(take(stored, x.parent))
-        R, p, S = place(x, parent)
-        Sqd = keep(S * qd)
-        V = keep(parent[12:18] + Sqd)
-        A = keep(parent[18:24] + S * qdd + motion_cross(V, Sqd))
+        R, p, S, Sqd, V = move(x, parent, qd)
+        A = accelerated(parent, S, qdd, V, Sqd)
         w = keep(parent[24:30] + S * c)
         here = keep(local(*keep(rigid_inertia(R, p, *body_of(x.value))), V, A, w, F))
         return put(stored, x.t, W, cat([R.reshape(9, W, -1), p, V, A, w])), (S, parent[12:], here)
@@ -120,11 +118,11 @@ def _adjoint(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd
         return add_to(stored, parent, keep(cat([f, A, up, here[18:]]))), out
 
     steps = steps_of(slot_index, slot_value, q, quat)
-    by_slot = F[:slots].reshape(-1, W, 6, F.shape[-1]).swapaxes(1, 2) if wrench else None
+    by_slot, on_base = wrenches_of(slot_index, F)
     rates = [by_step(slot_index, x) for x in (qd, qdd, c)]
     stored, bodies = lax.scan(outward, poses_from(slots, B, slot_value.dtype, V0, A0, w0), (steps, *rates, by_slot))
     motion = (jnp.broadcast_to(x[:, None], (6, 1, B)) for x in (V0, A0, w0))
-    at_base = local(*base_inertia(base_value), *motion, F[slots][:, None] if wrench else None)
+    at_base = local(*base_inertia(base_value), *motion, on_base)
     total = storage(slots, at_base[:, 0])
     total, slopes = lax.scan(inward, total, ((steps.t, steps.parent), bodies, rates[0]), reverse=True)
     of_q, of_qd, of_qdd = (by_dof(slot_index, x, rotor.shape[0]) for x in slopes)

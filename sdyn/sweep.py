@@ -13,7 +13,7 @@ from jax import lax
 from sdyn.chain import SlotRow, ValueRow
 from sdyn.materialise import keep
 from sdyn.rotation import matrix
-from sdyn.spatial import cat, cross, mm, mv, rigid_inertia
+from sdyn.spatial import cat, cross, mm, motion_cross, mv, rigid_inertia
 
 
 class Steps(NamedTuple):
@@ -109,6 +109,26 @@ def place(x: Steps, parent):
     a = mv(R, c[ValueRow.AXIS : ValueRow.AXIS + 3])
     S = keep(cat([a, mv(R, c[ValueRow.AXIS + 3 : ValueRow.MASS]) + cross(p, a)]))
     return R, p, S
+
+
+def move(x: Steps, parent, qd):
+    """`place`, with S q̇ and the twists V = V' + S q̇."""
+    R, p, S = place(x, parent)
+    Sqd = keep(S * qd)
+    return R, p, S, Sqd, keep(parent[12:18] + Sqd)
+
+
+def accelerated(parent, S, qdd, V, Sqd):
+    """Spatial accelerations A = A' + S q̈ + V x S q̇."""
+    return keep(parent[18:24] + S * qdd + motion_cross(V, Sqd))
+
+
+def wrenches_of(slot_index, F):
+    """Wrenches on the bodies of each step [T, 6, W, B], and on the base [6, 1, B]; None where F is empty."""
+    T, W = slot_index.shape[1:]
+    if not F.shape[0]:
+        return None, None
+    return F[: T * W].reshape(T, W, 6, -1).swapaxes(1, 2), F[T * W][:, None]
 
 
 def body_of(value):
