@@ -86,7 +86,10 @@ def _bytes(path: Path) -> bytes:
     if not path.exists():
         if not path.parent.is_dir():
             raise RobotError(f"there is no folder {str(path.parent)!r}, and so no file {str(path)!r}.")
-        known(path.name, sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS), "file named")
+        others = sorted(p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS)
+        if not others:
+            raise RobotError(f"there is no file {str(path)!r}.")
+        known(path.name, others, f"file in {str(path.parent)!r} named")
     try:
         with path.open("rb") as file:
             data = file.read(LIMIT + 1)

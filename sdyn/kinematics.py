@@ -146,7 +146,7 @@ def jacobian_columns(chain: Chain, pose: Pose, S, slot):
         turn = jax.vmap(lambda columns: turned_columns(chain, pose, columns.T).T)
         J = turn(J.reshape(-1, 6, nv)).reshape(J.shape)
     if chain.capacity.base_nv:
-        present = (slot <= n)[..., None, None] * chain.base_value[BaseRow.FREE]
+        present = jnp.where(slot <= n, chain.free, 0)[..., None, None]
         J = jnp.concatenate([jnp.eye(6, dtype=S.dtype) * present, J], -1)
     return J
 
