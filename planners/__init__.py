@@ -1,0 +1,12 @@
+"""Motion planning by gradients through the dynamics of `sdyn`, across changes of the structure.
+
+import jax; jax.config.update("jax_enable_x64", True)
+import planners
+plan = planners.plan(planners.load("grasp"))
+plan.save("out/grasp")
+"""
+
+from planners.certify import Certificate, certify
+from planners.driver import plan
+from planners.plan import PhaseResult, Plan
+from planners.task import Task, TaskError, load

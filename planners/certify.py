@@ -1,0 +1,255 @@
+"""Certificates: what a plan keeps, measured by code that is not the solver.
+
+What is independent: limits, grasp, tracking and momentum are read off the plan's arrays by `sdyn` functions that the
+solver does not call (momentum, body poses of each structure, forward dynamics); the splines are evaluated again by
+scipy; the motion is integrated again from the planned torques by articulated-body forward dynamics and an RK4 on
+quaternions. What is shared: the robot models, `sdyn` itself, and, for the stationarity only, the statement of the
+problem, which is differentiated here by central differences and weighed with the plan's multipliers.
+"""
+
+import importlib
+import json
+from dataclasses import asdict, dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sdyn
+
+LIMIT, MOMENTUM, STATIONARITY = 1e-6, 1e-10, 1e-3
+DRIFT = 1e-9  # of momentum within a phase, relative to its largest term
+INTEGRATION = 1e-6  # m, rad, m/s, rad/s: largest difference to the integrated motion
+DIFFERENCE = 1e-6  # step of central differences, scaled variables
+
+
+@dataclass(frozen=True)
+class Row:
+    """One check: passed if value <= bound."""
+
+    name: str
+    value: float
+    bound: float
+    unit: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the value is finite and within the bound."""
+        return bool(np.isfinite(self.value) and self.value <= self.bound)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Every check of one plan."""
+
+    rows: tuple[Row, ...]
+    active: tuple[str, ...] = ()
+    """Limits that the plan touches."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(row.ok for row in self.rows)
+
+    @property
+    def sentence(self) -> str:
+        """The certificate in one line of words."""
+        say = lambda r: f"{r.name} is {r.value:.3g} {r.unit}".rstrip() + f" and may be {r.bound:.3g}"
+        bad = [say(row) for row in self.rows if not row.ok]
+        touched = f"; it touches {', '.join(self.active)}" if self.active else ""
+        if bad:
+            return f"Not certified: {'; '.join(bad)}."
+        return f"Certified: {len(self.rows)} checks passed on a grid ten times finer than the solver's{touched}."
+
+    def __str__(self) -> str:
+        width = max(len(row.name) for row in self.rows)
+        say = lambda r: f"{'ok ' if r.ok else 'BAD'}  {r.name:{width}}  {r.value:9.2e} <= {r.bound:7.1e} {r.unit}"
+        lines = [say(row).rstrip() for row in self.rows]
+        return "\n".join([*lines, self.sentence])
+
+    def to_json(self) -> str:
+        """The certificate as JSON text."""
+        value = lambda row: row.value if np.isfinite(row.value) else None
+        rows = [asdict(row) | {"value": value(row), "ok": row.ok} for row in self.rows]
+        said = {"passed": self.passed, "sentence": self.sentence, "rows": rows, "active": list(self.active)}
+        return json.dumps(said, indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Certificate":
+        """Reads what `to_json` wrote."""
+        said = json.loads(text)
+        value = lambda row: np.nan if row["value"] is None else row["value"]
+        return cls(
+            tuple(Row(r["name"], value(r), r["bound"], r["unit"]) for r in said["rows"]), tuple(said["active"])
+        )
+
+
+def certify(task, plan) -> Certificate:
+    """Measures what a plan keeps.
+
+    Args:
+        task: What was asked for.
+        plan: What is offered; its arrays are read, never how they were made.
+    """
+    rows, active = _limits(task, plan)
+    module = importlib.import_module(f"planners.certify_{task.kind}")
+    rows += _integration(plan) + module.rows(task, plan) + [stationarity(task, plan)]
+    return Certificate(tuple(rows), tuple(active))
+
+
+def _limits(task, plan):
+    """Joint position, rate and torque on the fine grid: the largest excess over a limit, and which ones are touched."""
+    n, rows, active = len(task.joints), [], []
+    rest = lambda key: np.concatenate([getattr(phase, key)[:, -n:] for phase in plan.phases])
+    low, high = task.position_limits.T
+    excess = {
+        "position": np.maximum(rest("q") - high, low - rest("q")),
+        "rate": np.abs(rest("v")) - task.rate_limits,
+        "torque": np.abs(rest("tau")) - task.torque_limits,
+    }
+    widths = {"position": 1.0, "rate": task.rate_limits, "torque": task.torque_limits}
+    for (key, over), unit in zip(excess.items(), ("rad", "rad/s", "N m"), strict=True):
+        rows.append(Row(f"excess over {key} limits", float(max(over.max(), 0.0)), LIMIT, unit))
+        near = (over > -0.03 * widths[key]).any(axis=0)
+        active += [f"the {key} limit of {task.joints[k].name}" for k in np.flatnonzero(near)]
+    free = max(np.abs(phase.tau[:, :6]).max() for phase in plan.phases)
+    return [*rows, Row("force on the free base", float(free), 0.0, "N, N m")], active
+
+
+# -- motion integrated again -------------------------------------------------------------------------------------------
+
+
+def _turn(quat, theta):
+    """quat times the quaternion of the rotation vector theta."""
+    half = jnp.linalg.norm(theta) / 2
+    w, x = jnp.cos(half), theta / 2 * jnp.sinc(half / jnp.pi)
+    a, b = quat[0], quat[1:]
+    return jnp.concatenate([jnp.array([a * w - b @ x]), a * x + w * b + jnp.cross(b, x)])
+
+
+def _rate(chain, q0, state, tau):
+    """Rates of (rotation vector from q0's attitude, position, joints, v) under a torque."""
+    theta, p, joints, v = state
+    quat = _turn(q0[3:7], theta)
+    q = jnp.concatenate([p, quat / jnp.linalg.norm(quat), joints])
+    vdot = sdyn.forward_dynamics(chain, q, v, tau)
+    w, c = v[:3], jnp.cross(theta, v[:3])
+    K = jnp.cross(quat[1:], v[3:6]) * 2  # rotates v[3:6] to the world
+    return w + c / 2 + jnp.cross(theta, c) / 12, v[3:6] + quat[0] * K + jnp.cross(quat[1:], K), v[6:], vdot
+
+
+@jax.jit
+def integrate(chain, q, v, tau, steps):
+    """States [k + 1, nq], [k + 1, nv] from torques tau [k, 3, nv] at the start, middle and end of k steps [s]."""
+
+    def step(state, inputs):
+        (q, v), (tau, h) = state, inputs
+        start = (jnp.zeros(3), q[:3], q[7:], v)
+        along = lambda k, s: tuple(a + s * b for a, b in zip(start, k, strict=True))
+        k1 = _rate(chain, q, start, tau[0])
+        k2 = _rate(chain, q, along(k1, h / 2), tau[1])
+        k3 = _rate(chain, q, along(k2, h / 2), tau[1])
+        k4 = _rate(chain, q, along(k3, h), tau[2])
+        theta, p, joints, v = along([(a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)], h)
+        quat = _turn(q[3:7], theta)
+        new = jnp.concatenate([p, quat / jnp.linalg.norm(quat), joints]), v
+        return new, new
+
+    _, (qs, vs) = jax.lax.scan(step, (q, v), (tau, steps))
+    return jnp.concatenate([q[None], qs]), jnp.concatenate([v[None], vs])
+
+
+def _integration(plan):
+    """Largest differences between the plan and its motion integrated from the planned torques."""
+    worst = dict.fromkeys(("place of the base", "attitude of the base", "joint positions", "velocities"), 0.0)
+    capacity = sdyn.capacity([phase.robot for phase in plan.phases])
+    longest = max(len(phase.times) for phase in plan.phases) // 2
+    for phase in plan.phases:
+        qs, vs = _again(phase, capacity, longest)
+        q, v = phase.q[::2], phase.v[::2]
+        turn = 2 * np.sqrt(np.maximum(0.0, _quat_distance(qs[:, 3:7], q[:, 3:7])))
+        parts = (qs[:, :3] - q[:, :3], turn, qs[:, 7:] - q[:, 7:], vs - v)
+        worst = {k: max(x, float(np.abs(part).max())) for (k, x), part in zip(worst.items(), parts, strict=True)}
+    units = ("m", "rad", "rad", "rad/s, m/s")
+    return [Row(f"integrated again: {k}", x, INTEGRATION, u) for (k, x), u in zip(worst.items(), units, strict=True)]
+
+
+def _quat_distance(a, b):
+    """Squared distance of unit quaternions, either sign."""
+    return np.minimum(np.sum((a - b) ** 2, axis=1), np.sum((a + b) ** 2, axis=1))
+
+
+def _again(phase, capacity, longest):
+    """One phase integrated with steps of two intervals; padded with steps of no length to share one program."""
+    chain = sdyn.pack(phase.robot, capacity)
+    count = len(phase.times) // 2
+    pad = lambda x: np.concatenate([x, np.zeros((longest - count, *x.shape[1:]))])
+    tau = np.stack([phase.tau[:-1:2], phase.tau[1::2], phase.tau[2::2]], axis=1)
+    q, v = sdyn.pad(chain, phase.q[0], phase.v[0])
+    width = np.shape(v)[-1] - tau.shape[-1]
+    tau = np.pad(tau, ((0, 0), (0, 0), (0, width)))
+    qs, vs = integrate(chain, q, v, pad(tau), pad(np.diff(phase.times[::2])))
+    return np.asarray(qs)[: count + 1, : phase.q.shape[1]], np.asarray(vs)[: count + 1, : phase.v.shape[1]]
+
+
+# -- shared by the tasks -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the models say about one robot along one phase, world axes."""
+
+    R: np.ndarray  # [k, 3, 3] attitude of its frame
+    p: np.ndarray  # [k, 3] m
+    twist: np.ndarray  # [k, 6] rad/s, m/s
+    momentum: np.ndarray  # [k, 6] about its centre of mass, N m s, N s
+    centre: np.ndarray  # [k, 3] m
+
+    @property
+    def drift(self) -> np.ndarray:
+        """Largest changes of the angular and of the linear momentum, [2]."""
+        change = np.abs(self.momentum - self.momentum[0])
+        return np.array([change[:, :3].max(), change[:, 3:].max()])
+
+
+def see(movers) -> list[Seen]:
+    """Observes several (robot, frame, q, v), all by one program: one capacity, paths of one length."""
+    capacity = sdyn.capacity([robot for robot, _, _, _ in movers])
+    room = max(len(q) for _, _, q, _ in movers)
+    longer = lambda x: np.concatenate([x, np.repeat(x[-1:], room - len(x), axis=0)])
+    out = []
+    for robot, frame, q, v in movers:
+        chain = sdyn.pack(robot, capacity)
+        at = jnp.asarray(capacity.frame_names.index(frame))
+        seen = _see(chain, *sdyn.pad(chain, longer(q), longer(v)), at)
+        out.append(Seen(*(np.asarray(x)[: len(q)] for x in seen)))
+    return out
+
+
+@jax.jit
+def _see(chain, q, v, frame):
+    def one(q, v):
+        pose, twist = sdyn.frame_pose(chain, q, frame), sdyn.frame_velocity(chain, q, v, frame)
+        return *pose, twist, sdyn.momentum(chain, q, v), sdyn.centre_of_mass(chain, q)
+
+    return jax.vmap(one)(q, v)
+
+
+def stationarity(task, plan) -> Row:
+    """Gradient of the Lagrangian by central differences, relative to 1 + that of the cost, bounds left out."""
+    problem = importlib.import_module(f"planners.{task.kind}").problem(task, plan.info["options"]["fine"])
+    form, (data, low, high) = problem.form, problem.numbers
+    y, u = plan.multipliers["equal"], plan.multipliers["below"]
+    z = form.join(plan.variables)
+
+    @jax.jit
+    def lagrangian(z, y, u):
+        value = form.at(z, data)
+        return jnp.stack([value.cost, value.cost + y @ value.equal + u @ value.below]), value.below
+
+    steps = DIFFERENCE * np.eye(len(z))
+    slopes = np.array([lagrangian(z + s, y, u)[0] - lagrangian(z - s, y, u)[0] for s in steps]) / (2 * DIFFERENCE)
+    r, slack = slopes[:, 1], np.asarray(lagrangian(z, y, u)[1])
+    held = ((z <= low + 1e-6) & (r > 0)) | ((z >= high - 1e-6) & (r < 0))
+    worst = max(np.abs(np.where(held, 0.0, r)).max(), np.abs(u * slack).max(initial=0.0), -u.min(initial=0.0))
+    return Row("stationarity and complementarity", float(worst / (1 + np.abs(slopes[:, 0]).max())), STATIONARITY, "")

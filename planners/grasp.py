@@ -1,0 +1,368 @@
+"""The grasp of a tumbling target by a free-floating arm, as a problem.
+
+Variables: four durations; the joints' state (position, rate, acceleration) where tracking starts and where the grasp
+is; the joints' end; inner control points of a quintic spline for each phase. The splines join with continuous
+accelerations and start and end at rest by construction. The base follows from momentum, before and after the grasp;
+torques from inverse dynamics. At the grasp the target joins the chain: momenta add, the joints' path goes on.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sdyn
+from planners import floating
+from planners.bspline import Clamped
+from planners.floating import Momentum, Tumble
+from planners.plan import PhaseResult
+from planners.problem import Block, Form, Problem, Rows, Values
+from planners.task import Task
+
+MOVING = ("approach", "track", "stabilise")
+TABLE_STEP = 0.1  # s; Munthe-Kaas RK4 at the tumble rates of satellites errs by less than 1e-12 rad a minute
+
+
+class Data(NamedTuple):
+    """Numbers of one grasp; all traced."""
+
+    chains: sdyn.Chain  # the chaser and the compound, stacked
+    waiting: Tumble  # the chaser with its joints at rest
+    target: Tumble
+    grip: tuple  # (rotation [3, 3], position [3]) of the grasp frame in the target's base
+    q0: jax.Array  # [n] joints at the start
+    position: jax.Array  # [n, 2] limits
+    rate: jax.Array  # [n]
+    torque: jax.Array  # [n]
+    margin: jax.Array  # [] part of the torque kept free
+    weights: jax.Array  # [3] time, torque, smoothness
+
+
+class Motion(NamedTuple):
+    """One phase on its grid of k + 1 points; the base before and the joints after."""
+
+    times: jax.Array  # [k + 1] s
+    R: jax.Array  # [k + 1, 3, 3]
+    p: jax.Array  # [k + 1, 3]
+    q: jax.Array  # [k + 1, n]
+    v: jax.Array  # [k + 1, 6 + n]
+    vdot: jax.Array  # [k + 1, 6 + n]
+    tau: jax.Array  # [k + 1, n]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Splines and grids of the three moving phases; `fine` multiplies the intervals."""
+
+    splines: tuple[Clamped, ...]
+    intervals: tuple[int, ...]
+
+    @classmethod
+    def of(cls, task: Task, fine: float = 1.0) -> "Grid":
+        """The grid of a task."""
+        phases = [task.phases[name] for name in MOVING]
+        return cls(
+            tuple(Clamped(p.control_points) for p in phases),
+            tuple(max(4, round(p.intervals * fine)) for p in phases),
+        )
+
+
+def control_points(grid: Grid, x, q0):
+    """Control points of the three phases, [count, n] each, from the variables by name."""
+    T, rest = x["durations"][1:], jnp.zeros_like(q0)
+    stops = [jnp.stack([q0, rest, rest]), x["track_state"], x["grasp_state"], jnp.stack([x["end"], rest, rest])]
+    out = []
+    for k, (name, spline) in enumerate(zip(MOVING, grid.splines, strict=True)):
+        first, last = spline.ends
+        powers = jnp.stack([T[k] ** 0, T[k], T[k] ** 2])[:, None]
+        out.append(jnp.concatenate([first @ (powers * stops[k]), x[name], last @ (powers * stops[k + 1])]))
+    return out
+
+
+def paths(grid: Grid, points, T):
+    """Joint position, rate and acceleration at grid points and midpoints of each phase, [2 k + 1, n] each."""
+    out = []
+    for spline, count, P, length in zip(grid.splines, grid.intervals, points, T, strict=True):
+        s = np.linspace(0, 1, 2 * count + 1)
+        out.append(tuple(spline.basis(s, order) @ P / length**order for order in range(3)))
+    return out
+
+
+def later(tumble: Tumble, time) -> Momentum:
+    """Momentum of a drifting system, with its centre of mass at a time."""
+    m = tumble.momentum
+    return m._replace(centre=m.centre + m.linear * (time / tumble.coupling.mass))
+
+
+def motion(grid: Grid, x, data: Data) -> tuple[Motion, Motion, Motion]:
+    """The motion of approach, tracking and stabilising from the variables by name, physical units."""
+    wait, *T = x["durations"]
+    approach, track, after = paths(grid, control_points(grid, x, data.q0), T)
+    path = tuple(jnp.concatenate([a, b[1:], c]) for a, b, c in zip(approach, track, after, strict=True))
+    steps = jnp.concatenate([jnp.broadcast_to(t / n, (n,)) for t, n in zip(T, grid.intervals, strict=True)])
+    first, second, _ = grid.intervals
+    split, grasp = first + second, wait + T[0] + T[1]
+    momenta = later(data.waiting, wait), floating.momentum_sum(
+        (data.waiting.coupling.mass, data.target.coupling.mass), (later(data.waiting, grasp), later(data.target, grasp))
+    )
+    # points and midpoints of the whole grid; the grasp is there twice, once in each structure
+    after_grasp = np.arange(len(path[0])) > 2 * split
+    chains = jax.tree.map(lambda a: a[after_grasp.astype(int)], data.chains)
+    c = floating.couplings(chains, path[0])
+    cut = lambda a: (a[: 2 * split + 1], a[2 * split + 1 :])
+    stages = lambda a: tuple(jnp.concatenate(pair) for pair in zip(*map(floating.thirds, cut(a)), strict=True))
+    angular = jnp.stack([m.angular for m in momenta])[(np.arange(sum(grid.intervals)) >= split).astype(int)]
+    R0, _, _ = floating.tumbled(data.waiting, wait)
+    R = floating.attitudes(R0, stages(c.compliance), stages(floating.drift(c, path[1])), angular, steps)
+    # from here on, grid points only
+    points = lambda a: jnp.concatenate([part[::2] for part in cut(a)])
+    c, chains, (q, rate, acceleration) = jax.tree.map(points, (c, chains, path))
+    R = jnp.concatenate([R[: split + 1], R[split:]])
+    times = wait + jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+    times = jnp.concatenate([times[: split + 1], times[split:]])
+    late = (np.arange(len(q)) > split).astype(int)
+    momentum = jax.tree.map(lambda *m: jnp.stack(m)[late], *momenta)
+    twist = jax.vmap(floating.base_twist)(c, R, rate, momentum)
+    p = jax.vmap(floating.base_position)(c, R, times - jnp.stack([wait, grasp])[late], momentum)
+    v = jnp.concatenate([twist, rate], axis=1)
+    tau, vdot = floating.free_torques(chains, c, q, v, acceleration)
+    whole = Motion(times, R, p, q, v, vdot, tau)
+    parts = slice(first + 1), slice(first, split + 1), slice(split + 1, None)
+    return tuple(jax.tree.map(lambda a: a[part], whole) for part in parts)
+
+
+def hand_motion(chains, frame: str, at: Motion):
+    """Pose and twist of a frame of the chaser at every grid point, world axes: R, p, angular, linear."""
+
+    @floating.locally
+    def local(chain, x):
+        q = floating.at_rest(x[:n])
+        R, p = sdyn.frame_pose(chain, q, frame)
+        return jnp.concatenate([R.ravel(), p, sdyn.frame_velocity(chain, q, x[n:], frame)])
+
+    k, n = at.q.shape
+    chain = jax.tree.map(lambda a: jnp.broadcast_to(a[0], (k, *a.shape[1:])), chains)
+    y = local(chain, jnp.concatenate([at.q, at.v], axis=1))
+    turn = lambda x: jnp.einsum("kij,kj->ki", at.R, x)
+    return at.R @ y[:, :9].reshape(k, 3, 3), at.p + turn(y[:, 9:12]), turn(y[:, 12:15]), turn(y[:, 15:])
+
+
+def grip_motion(data: Data, time):
+    """Pose and twist of the grasp frame at a time, world axes: R, p, angular, linear."""
+    R, p, v = floating.tumbled(data.target, time)
+    turn, lever = data.grip
+    return R @ turn, p + R @ lever, R @ v[:3], R @ (v[3:] + floating.cross(v[:3], lever))
+
+
+def relative(data: Data, frame: str, at: Motion):
+    """Pose and twist of the hand relative to the grasp frame at every grid point.
+
+    Returns:
+        (position [k, 3] m, rotation vector [k, 3] rad, angular [k, 3] rad/s, linear [k, 3] m/s), world axes; the
+        rotation vector in axes of the grasp frame, exact to third order.
+    """
+    hand, grip = hand_motion(data.chains, frame, at), jax.vmap(grip_motion, (None, 0))(data, at.times)
+    turn = jax.vmap(lambda a, b: floating.logarithm(a.T @ b))(grip[0], hand[0])
+    return hand[1] - grip[1], turn, hand[2] - grip[2], hand[3] - grip[3]
+
+
+def _trapezoid(steps):
+    """Weights of the trapezoid rule, [k + 1]."""
+    return jnp.concatenate([steps / 2, jnp.zeros(1)]) + jnp.concatenate([jnp.zeros(1), steps / 2])
+
+
+def two_sided(value, lower, upper):
+    """Rows value <= upper and value >= lower, joint by joint: [..., n] to [n * rows * 2]."""
+    both = jnp.stack([value - upper, lower - value], axis=-1)
+    return jnp.moveaxis(both, -2, 0).ravel()
+
+
+def residuals(data: Data, motions):
+    """Torque, relative to its limit, and acceleration, so that half their squares are the integrals of the cost."""
+    n, out = len(data.q0), []
+    for at in motions:
+        root = jnp.sqrt(2 / n * _trapezoid(jnp.diff(at.times)))[:, None]
+        out.append((root * jnp.sqrt(data.weights[1]) * at.tau / data.torque).ravel())
+        out.append((root * jnp.sqrt(data.weights[2]) * at.vdot[:, 6:]).ravel())
+    return jnp.concatenate(out)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Cost and constraints, for one grid, one frame of the hand, and the grid points of the tracking phase where the
+    poses must agree.
+    """
+
+    grid: Grid
+    frame: str
+    poses: tuple[int, ...]
+
+    def __call__(self, x, data: Data) -> Values:
+        """The values for variables by name, physical units."""
+        T, splines = x["durations"], self.grid.splines
+        P = control_points(self.grid, x, data.q0)
+        motions = motion(self.grid, x, data)
+        rates = [s.hull(1) @ p / t / data.rate for s, p, t in zip(splines, P, T[1:], strict=True)]
+        torque = jnp.concatenate([at.tau for at in motions]) / data.torque
+        place, turn, spin, slide = relative(data, self.frame, motions[1])
+        poses, ends = np.array(self.poses), np.array([0, -1])
+        below = (
+            two_sided(jnp.concatenate(P), data.position[:, 0], data.position[:, 1]),
+            two_sided(jnp.concatenate(rates), -1.0, 1.0),
+            two_sided(torque, data.margin - 1, 1 - data.margin),
+        )
+        return Values(
+            data.weights[0] * T.sum(),
+            residuals(data, motions),
+            jnp.concatenate([e.ravel() for e in (place[poses], turn[poses], spin[ends], slide[ends])]),
+            jnp.concatenate(below),
+        )
+
+
+def rows(task: Task, grid: Grid, poses):
+    """Names of the constraint rows: (equalities, inequalities), in the order of `values`."""
+    hand, grip = task.robot.frame, task.target.frame
+    equal = (
+        Rows(f"place of {hand!r} on {grip!r} while tracking", 1.0, "m", (len(poses), 3)),
+        Rows(f"orientation of {hand!r} on {grip!r} while tracking", 1.0, "rad", (len(poses), 3)),
+        Rows(f"angular velocity of {hand!r} relative to {grip!r}", 1.0, "rad/s", (2, 3)),
+        Rows(f"velocity of {hand!r} relative to {grip!r}", 1.0, "m/s", (2, 3)),
+    )
+    points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
+    names = [j.name for j in task.joints]
+    below = [Rows(f"position limit of {n}", 1.0, "rad", (points, 2)) for n in names]
+    below += [Rows(f"rate limit of {n}", r, "rad/s", (points - 3, 2)) for n, r in zip(names, task.rate_limits, strict=True)]
+    below += [Rows(f"torque limit of {n}", t, "N m", (torques, 2)) for n, t in zip(names, task.torque_limits, strict=True)]
+    return equal, tuple(below)
+
+
+def data(task: Task) -> Data:
+    """The numbers of a task."""
+    chaser, body = task.chaser, task.body
+    resting = chaser.lock(dict(zip([j.name for j in task.joints], task.start, strict=True)))
+    horizon = sum(phase.duration[1] for phase in task.phases.values())
+    q = np.stack([
+        resting.neutral(),
+        body.configuration(position=task.target.position, quaternion=task.target.quaternion),
+    ])
+    v = np.stack([np.zeros(6), task.target.twist])
+    tumbles = _tumbles(sdyn.family([resting, body]), q, v, horizon)
+    waiting, target = (jax.tree.map(lambda a: a[k], tumbles) for k in range(2))
+    w = task.weights
+    return Data(
+        sdyn.family([chaser, task.compound]),
+        waiting,
+        target,
+        _grip(body, f"target_{task.target.frame}"),
+        jnp.asarray(task.start),
+        jnp.clip(jnp.asarray(task.position_limits), -1e3, 1e3),
+        jnp.asarray(task.rate_limits),
+        jnp.asarray(task.torque_limits),
+        jnp.asarray(task.limits.margin),
+        jnp.array([w.time, w.torque, w.smoothness]),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _tumbles(chains, q, v, horizon):
+    return jax.vmap(lambda chain, q, v: floating.tumble(chain, q, v, horizon, TABLE_STEP))(chains, q, v)
+
+
+def _grip(body, frame):
+    """Pose of a frame in the base of a rigid robot."""
+    return tuple(map(jnp.asarray, sdyn.frame_pose(sdyn.pack(body), body.neutral(), frame)))
+
+
+def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
+    """The motion on a grid `fine` times finer than the solver's, from the variables by name."""
+    grid = Grid.of(task, fine)
+    motions = _detailed(grid, x, data)
+    waiting = np.linspace(0.0, x["durations"][0], fine + 1)
+    chaser, target = (_states(tumble, waiting) for tumble in (data.waiting, data.target))
+    n, free = len(task.joints), lambda tau: np.hstack([np.zeros((len(tau), 6)), tau])
+    still = np.tile(task.start, (len(waiting), 1)), np.zeros((len(waiting), n))
+    state = [np.hstack([part, more]) for part, more in zip(chaser, still, strict=True)]
+    out = [PhaseResult("wait", task.chaser, waiting, *state, free(0 * still[0]), (task.body, *target))]
+    for name, at in zip(MOVING, motions, strict=True):
+        at = jax.tree.map(np.asarray, at)
+        q = np.hstack([at.p, _quaternions(at.R), at.q])
+        passive = None if name == "stabilise" else (task.body, *_states(data.target, at.times))
+        robot = task.compound if name == "stabilise" else task.chaser
+        out.append(PhaseResult(name, robot, at.times, q, at.v, free(at.tau), passive))
+    return tuple(out)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _detailed(grid, x, data):
+    return motion(grid, x, data)
+
+
+@jax.jit
+def _tumbled(body, times):
+    return jax.vmap(floating.tumbled, (None, 0))(body, times)
+
+
+def _states(body, times):
+    """q [k, 7] and v [k, 6] of a drifting rigid body."""
+    R, p, v = map(np.asarray, _tumbled(body, jnp.asarray(times)))
+    return np.hstack([p, _quaternions(R)]), v
+
+
+def _quaternions(R):
+    """Unit quaternions [k, 4] along a path of rotations, without jumps of sign."""
+    quat = np.asarray(jax.jit(jax.vmap(floating.quaternion))(jnp.asarray(R)))
+    turn = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
+    return quat * np.cumprod(np.r_[1.0, turn])[:, None]
+
+
+def pose_points(task: Task, grid: Grid) -> np.ndarray:
+    """Grid points of the tracking phase where the poses must agree, evenly spread: with the velocities at both ends,
+    two conditions fewer than the spline has control points.
+    """
+    return np.unique(np.round(np.linspace(0, grid.intervals[1], grid.splines[1].count - 4)).astype(int))
+
+
+def problem(task: Task, fine: float = 1.0) -> Problem:
+    """The problem of a task, its grid multiplied by `fine`."""
+    grid, n = Grid.of(task, fine), len(task.joints)
+    poses = pose_points(task, grid)
+    low, high = np.array([task.phases[name].duration for name in task.phases]).T
+    units = (1.0, 0.1, 0.05)  # rad, rad/s, rad/s^2
+    blocks = (
+        Block("durations", (4,), 10.0),
+        Block("track_state", (3, n), units),
+        Block("grasp_state", (3, n), units),
+        Block("end", (n,)),
+        *(Block(name, (s.count - 6, n)) for name, s in zip(MOVING, grid.splines, strict=True)),
+    )
+    form = Form(blocks, Grasp(grid, task.robot.frame, tuple(map(int, poses))))
+    return Problem(form, data(task), {"durations": low}, {"durations": high}, *rows(task, grid, poses))
+
+
+def first_guess(task: Task, problem: Problem, count: int) -> np.ndarray:
+    """The best of `count` first guesses, scaled."""
+    from planners import seeds
+
+    form = problem.form
+    z = np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, count)])
+    if count == 1:
+        return z[0]
+    z, merits = seeds.improve(form, z, problem.numbers)
+    return np.asarray(z[np.argmin(merits)])
+
+
+def results(task: Task, problem: Problem, x: dict) -> dict:
+    """What the plan's description says about this task."""
+    return {"durations_s": dict(zip(task.phases, map(float, x["durations"]), strict=True))}
+
+
+def sentence(x: dict, state) -> str:
+    """The verdict on a solved plan."""
+    wait, approach, track, stabilise = x["durations"]
+    return (
+        f"The target is grasped after {wait + approach + track:.2f} s (wait {wait:.2f}, approach {approach:.2f}, track "
+        f"{track:.2f}) and at rest {stabilise:.2f} s later."
+    )

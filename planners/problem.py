@@ -1,0 +1,163 @@
+"""The problem that solvers see: a vector of variables in named blocks, a cost, and named rows of constraints.
+
+    minimise  smooth(z) + |r(z)|^2 / 2   subject to  e(z) = 0,  i(z) <= 0,  lower <= z <= upper
+
+Variables and rows are scaled: z = x / scale of its block, and a row is its physical value divided by the row's scale,
+so that 1 is a large violation everywhere. `Rows` carries names, units and scales back to the reader.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Values(NamedTuple):
+    """What a problem is at one point."""
+
+    smooth: jax.Array  # [] cost that is not a square
+    residual: jax.Array  # [r]; the cost has half its square
+    equal: jax.Array  # [e]
+    below: jax.Array  # [i], at most zero
+
+    @property
+    def cost(self):
+        """The cost, []."""
+        return self.smooth + self.residual @ self.residual / 2
+
+
+class Linear(NamedTuple):
+    """A problem near one point."""
+
+    cost: jax.Array  # []
+    gradient: jax.Array  # [n]
+    curvature: jax.Array  # [n, n] Gauss-Newton
+    equal: jax.Array  # [e]
+    A: jax.Array  # [e, n]
+    below: jax.Array  # [i]
+    C: jax.Array  # [i, n]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A group of constraint rows.
+
+    Args:
+        name: What it holds, in words: "torque of arm_3".
+        scale: Physical value of 1.
+        unit: Unit of the physical value.
+        shape: Shape of the group; rows lie in C order.
+    """
+
+    name: str
+    scale: float
+    unit: str
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return int(np.prod(self.shape))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A named group of variables; its scale is one number, or one for each entry of the first axis."""
+
+    name: str
+    shape: tuple[int, ...]
+    scale: float | tuple[float, ...] = 1.0
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return int(np.prod(self.shape, dtype=int))
+
+    @property
+    def unit(self) -> np.ndarray:
+        """Physical value of 1, broadcast to the shape."""
+        scale = np.reshape(self.scale, np.shape(self.scale) + (1,) * (len(self.shape) - np.ndim(self.scale)))
+        return np.broadcast_to(scale, self.shape)
+
+
+@dataclass(frozen=True)
+class Form:
+    """A problem without its numbers: what is compiled. Equal forms share one compilation.
+
+    Args:
+        blocks: The variables.
+        values: Hashable; values(x, data) -> Values, with x the variables by name, physical units.
+    """
+
+    blocks: tuple[Block, ...]
+    values: Callable
+
+    def join(self, x: dict) -> np.ndarray:
+        """Variables by name (physical, broadcast to their blocks) to the vector z (scaled), on the host."""
+        return np.concatenate([(np.broadcast_to(x[b.name], b.shape) / b.unit).ravel() for b in self.blocks])
+
+    def split(self, z) -> dict:
+        """The vector z (scaled) to variables by name (physical)."""
+        out, at = {}, 0
+        for b in self.blocks:
+            out[b.name] = z[at : at + b.size].reshape(b.shape) * b.unit
+            at += b.size
+        return out
+
+    def at(self, z, data) -> Values:
+        """The problem at z (scaled)."""
+        return self.values(self.split(z), data)
+
+    def near(self, z, data) -> Linear:
+        """The problem and its first derivatives at z (scaled): forward mode, one tangent per variable, batched."""
+        at = lambda z: self.at(z, data)
+        v, push = jax.linearize(at, z)
+        J = jax.vmap(push, out_axes=-1)(jnp.eye(z.size, dtype=z.dtype))
+        return Linear(
+            v.cost,
+            J.smooth + v.residual @ J.residual,
+            J.residual.T @ J.residual,
+            v.equal,
+            J.equal,
+            v.below,
+            J.below,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A form with its numbers, all traced: another target or limit compiles nothing.
+
+    Args:
+        form: What is compiled.
+        data: Numbers that the form's values read, any pytree.
+        lower, upper: Bounds of the variables by name, physical units; none where not named.
+        equal, below: Names of the rows, in order.
+    """
+
+    form: Form
+    data: Any
+    lower: dict
+    upper: dict
+    equal: tuple[Rows, ...]
+    below: tuple[Rows, ...]
+
+    @property
+    def numbers(self) -> tuple:
+        """(data, lower [n], upper [n]): all that is traced; the bounds scaled."""
+        free = lambda bounds, x: self.form.join({b.name: x for b in self.form.blocks} | bounds)
+        return self.data, free(self.lower, -np.inf), free(self.upper, np.inf)
+
+    def worst(self, equal, below, count: int = 3) -> list[tuple[str, float, str]]:
+        """The groups that are violated most, relative to their scale: (name, amount, unit), physical units."""
+        out, parts = [], [(self.equal, np.abs(equal)), (self.below, np.maximum(below, 0.0))]
+        for groups, values in parts:
+            at = 0
+            for rows in groups:
+                amount = values[at : at + rows.size].max(initial=0.0)
+                at += rows.size
+                out.append((amount, (rows.name, float(amount * rows.scale), rows.unit)))
+        return [x for amount, x in sorted(out, key=lambda x: -x[0])[:count] if amount > 0]

@@ -1,0 +1,110 @@
+"""First guesses for the grasp: inverse kinematics at many times and from many postures, improved by optax."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+import sdyn
+from planners import floating, grasp
+from planners.problem import Form
+from planners.sqp import violation
+from planners.task import Task
+
+TIMES, POSTURES = 12, 8  # candidates of the grasp's time, and random postures for each
+KINEMATIC_STEPS = 60
+DAMPING = 1e-3
+PENALTY = 30.0  # of the l1 violation while optax improves a guess
+DESCENT = (150, 3e-3)  # steps and rate of Adam
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def reach(frame: str, data: grasp.Data, times, q):
+    """Joints that bring the hand to the grasp at times [k], from postures q [k, n], with the base as while waiting.
+
+    Returns:
+        (q [k, n], miss [k]): the postures, and the norms of what is left of the pose errors [m, rad].
+    """
+    chain = jax.tree.map(lambda a: a[0], data.chains)
+
+    def one(time, q):
+        R, p, _ = floating.tumbled(data.waiting, time)
+        R_goal, p_goal, _, _ = grasp.grip_motion(data, time)
+
+        def error(q):
+            R_hand, p_hand = sdyn.frame_pose(chain, floating.at_rest(q), frame)
+            return jnp.concatenate([p + R @ p_hand - p_goal, floating.logarithm(R_goal.T @ R @ R_hand)])
+
+        def step(q, _):
+            J, e = jax.jacfwd(lambda q: (error(q),) * 2, has_aux=True)(q)
+            dq = -J.T @ jnp.linalg.solve(J @ J.T + DAMPING * (e @ e + 1e-9) * jnp.eye(6), e)
+            dq = dq * jnp.minimum(1.0, 0.3 / (jnp.abs(dq).max() + 1e-12))
+            return jnp.clip(q + dq, data.position[:, 0], data.position[:, 1]), jnp.linalg.norm(e)
+
+        q, miss = jax.lax.scan(step, q, None, length=KINEMATIC_STEPS)
+        return q, miss[-1]
+
+    return jax.vmap(one)(times, q)
+
+
+def guesses(task: Task, data: grasp.Data, grid: grasp.Grid, count: int, seed: int = 0) -> list[dict]:
+    """The best first guesses, by name, physical units: what is out of reach last, then by the time they need."""
+    low, high = np.array([task.phases[name].duration for name in task.phases]).T
+    rng, n = np.random.default_rng(seed), len(task.joints)
+    earliest = low.sum() - low[3]
+    times = np.repeat(np.linspace(earliest, max(earliest, high[:3].sum() * 0.9), TIMES), POSTURES)
+    spread = np.tile(np.r_[0.0, np.full(POSTURES - 1, 0.8)], TIMES)[:, None]
+    limits = np.asarray(data.position)
+    start = np.clip(task.start + spread * rng.normal(size=(len(times), n)), limits[:, 0], limits[:, 1])
+    q, miss = reach(task.robot.frame, data, jnp.asarray(times), jnp.asarray(start))
+    tracking = np.clip(0.5 * (low[2] + high[2]), low[2], high[2])
+    before, miss_before = reach(task.robot.frame, data, jnp.asarray(times - tracking), q)
+    q, before, miss = np.asarray(q), np.asarray(before), np.asarray(miss + miss_before)
+    need = 2.0 * (np.abs(before - task.start) / task.rate_limits).max(axis=1)
+    need = np.maximum(need, 2.0 * np.abs(q - before).max(axis=1) / task.rate_limits.min())
+    late = np.maximum(need - (times - tracking), 0.0)
+    order = np.argsort(100 * np.maximum(miss - 1e-6, 0) + late + 0.1 * times + 0.1 * need, kind="stable")
+    return [
+        _guess(task, grid, times[k], tracking, np.clip(need[k], low[1], high[1]), before[k], q[k]) for k in order[:count]
+    ]
+
+
+def _guess(task, grid, time, tracking, approach, before, q):
+    low, high = np.array([task.phases[name].duration for name in task.phases]).T
+    rate, rest = (q - before) / tracking, np.zeros_like(q)
+    x = {
+        "durations": np.clip([time - tracking - approach, approach, tracking, 0.5 * (low[3] + high[3])], low, high),
+        "track_state": np.stack([before, rate, rest]),
+        "grasp_state": np.stack([q, rate, rest]),
+        "end": q + rate * 2.0,
+    }
+    stops = (task.start, before, q, x["end"])
+    for k, (name, spline) in enumerate(zip(grasp.MOVING, grid.splines, strict=True)):
+        s = np.array([spline.knots[j + 1 : j + 1 + spline.degree].mean() for j in range(3, spline.count - 3)])[:, None]
+        x[name] = stops[k] * (1 - s) + stops[k + 1] * s
+    return x
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _descend(form: Form, z, numbers):
+    data, lower, upper = numbers
+    adam = optax.adam(optax.cosine_decay_schedule(DESCENT[1], DESCENT[0]))
+
+    def merit(z):
+        v = form.at(z, data)
+        return v.cost + PENALTY * violation(v.equal, v.below)[0]
+
+    def step(carry, _):
+        z, state = carry
+        move, state = adam.update(jax.grad(merit)(z), state)
+        return (jnp.clip(z + move, lower, upper), state), None
+
+    (z, _), _ = jax.lax.scan(step, (z, adam.init(z)), None, length=DESCENT[0])
+    return z, merit(z)
+
+
+def improve(form: Form, z, numbers):
+    """Guesses [seeds, n] (scaled) after a descent on the cost with an l1 penalty, and their merits [seeds]."""
+    return jax.vmap(_descend, (None, 0, None))(form, z, numbers)
