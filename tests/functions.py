@@ -5,7 +5,7 @@ All take arrays in the layout of the common capacity, so each is compiled once f
 
 import jax
 import jax.numpy as jnp
-from structures import on_states
+from structures import QUICKLY, on_states
 
 import sdyn
 
@@ -51,8 +51,8 @@ SOLVE = on_states(sdyn.solve_mass)
 POSES = on_states(sdyn.body_poses)
 MOTION = on_states(motion)
 TOTALS = on_states(totals)
-ALONG = on_states(along)
+ALONG = on_states(along, **QUICKLY)
 REGRESSOR = on_states(lambda chain, q, v, vdot, gravity: sdyn.regressor(chain, q, v, vdot, gravity=gravity))
-GENERALISED = on_states(sdyn.generalised_jacobian, 1)
+GENERALISED = on_states(sdyn.generalised_jacobian, **QUICKLY)
 TRANSFER = jax.jit(sdyn.transfer)
-SLOPES = on_states(jax.jacfwd(fd, (1, 2)))
+SLOPES = on_states(jax.jacfwd(fd, (1, 2)), **QUICKLY)

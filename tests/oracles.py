@@ -1,8 +1,9 @@
 """The reference data in `data/`, in the conventions of `sdyn`.
 
 `treeN*` hold free trees of N joints and 20 states of them, computed by a plain Newton-Euler program in world
-coordinates (mass matrix from unit accelerations, accelerations by Cholesky, derivatives by the complex step) that shares
-no code with `sdyn`; `top_*` are torque-free tops in quadruple precision; `free_floater_two_body` is a closed form.
+coordinates (mass matrix from unit accelerations, accelerations by Cholesky, derivatives by the complex step) that
+shares no code with `sdyn`; `top_*` are torque-free tops in quadruple precision; `free_floater_two_body` is a closed
+form.
 
 Their velocity is [v of the base, w of the base, joint rates], linear first; Jacobians and accelerations of points have
 rows [linear; angular]. Everything returned here is angular first.

@@ -93,7 +93,7 @@ def renamed(robot, seed=0):
 
 def without_mass(robot, *names):
     """The robot with links that weigh nothing, as fixtures do."""
-    return replace(robot, links=[sdyn.Link(x.name, 0.0) if x.name in names else x for x in robot.links])
+    return replace(robot, links=[sdyn.Link(x.name, 0.0, x.com) if x.name in names else x for x in robot.links])
 
 
 UNBALANCED = (0, 1, 0, 2, 4, 2, 5, 7)  # depths 1 to 6, declared in another order than depth first
@@ -271,9 +271,12 @@ def real(robot) -> np.ndarray:
     return out
 
 
-def on_states(f, fixed=1):
-    """f for one state, jitted for `STATES` of them: the first `fixed` arguments are shared."""
-    return jax.jit(lambda *x: jax.vmap(f, (*(None,) * fixed, *(0,) * (len(x) - fixed)))(*x))
+def on_states(f, **options):
+    """f for one state, jitted for `STATES` of them that share the first argument, the structure."""
+    return jax.jit(lambda *x: jax.vmap(f, (None, *(0,) * (len(x) - 1)))(*x), **options)
+
+
+QUICKLY = dict(compiler_options={"xla_backend_optimization_level": 0})  # for what is compiled for one test only
 
 
 def close(x, y, rtol, scale=None):
