@@ -24,7 +24,7 @@ def rows(task, plan) -> list[Row]:
 def _ends(task, plan):
     """Start as the task says, phases that join, rest at the end, and the target's own motion."""
     first, n = plan.phases[0], len(task.joints)
-    start = np.abs(first.q[0] - task.chaser.configuration(task.robot.joints)).max()
+    start = np.abs(first.q[0] - task.first).max()
     state = task.body.configuration(position=task.target.position, quaternion=task.target.quaternion)
     q, v = first.passive[1][0], first.passive[2][0]
     sign = np.r_[np.ones(3), np.full(4, np.sign(q[3:] @ state[3:]))]

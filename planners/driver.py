@@ -90,17 +90,18 @@ def _result(task, problem, module, state, history, options):
     }
     phases = module.phases(task, problem.data, x, round(FINE * fine))
     multipliers = {"equal": np.asarray(state.y), "below": np.asarray(state.u)}
-    return Plan(task, phases, state.status, _verdict(problem, state, x, module), x, multipliers, history, {}, info)
+    verdict = _verdict(problem, state, x, module, info)
+    return Plan(task, phases, state.status, verdict, x, multipliers, history, {}, info)
 
 
-def _verdict(problem, state, x, module):
+def _verdict(problem, state, x, module, info):
     worst = "; ".join(f"{name} is off by {amount:.3g} {unit}" for name, amount, unit in _worst(problem, state))
     if state.status == "infeasible":
         return f"No motion was found that keeps all constraints: {worst}."
     if state.status == "not converged":
         end = f": {worst}." if worst else "."
         return f"The solver stopped before the optimum after {state.iteration} iterations{end}"
-    return module.sentence(x, state)
+    return module.sentence(x, info["results"])
 
 
 def _worst(problem, state):

@@ -7,6 +7,7 @@ torques from inverse dynamics. At the grasp the target joins the chain: momenta 
 """
 
 import functools
+import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -131,7 +132,7 @@ def motion(grid: Grid, x, data: Data) -> tuple[Motion, Motion, Motion]:
     tau, vdot = floating.free_torques(chains, c, q, v, acceleration)
     whole = Motion(times, R, p, q, v, vdot, tau)
     parts = slice(first + 1), slice(first, split + 1), slice(split + 1, None)
-    return tuple(jax.tree.map(lambda a: a[part], whole) for part in parts)
+    return tuple(jax.tree.map(operator.itemgetter(part), whole) for part in parts)
 
 
 def hand_motion(chains, frame: str, at: Motion):
@@ -169,7 +170,7 @@ def relative(data: Data, frame: str, at: Motion):
     return hand[1] - grip[1], turn, hand[2] - grip[2], hand[3] - grip[3]
 
 
-def _trapezoid(steps):
+def trapezoid(steps):
     """Weights of the trapezoid rule, [k + 1]."""
     return jnp.concatenate([steps / 2, jnp.zeros(1)]) + jnp.concatenate([jnp.zeros(1), steps / 2])
 
@@ -184,7 +185,7 @@ def residuals(data: Data, motions):
     """Torque, relative to its limit, and acceleration, so that half their squares are the integrals of the cost."""
     n, out = len(data.q0), []
     for at in motions:
-        root = jnp.sqrt(2 / n * _trapezoid(jnp.diff(at.times)))[:, None]
+        root = jnp.sqrt(2 / n * trapezoid(jnp.diff(at.times)))[:, None]
         out.append((root * jnp.sqrt(data.weights[1]) * at.tau / data.torque).ravel())
         out.append((root * jnp.sqrt(data.weights[2]) * at.vdot[:, 6:]).ravel())
     return jnp.concatenate(out)
@@ -232,11 +233,17 @@ def rows(task: Task, grid: Grid, poses):
         Rows(f"velocity of {hand!r} relative to {grip!r}", 1.0, "m/s", (2, 3)),
     )
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
+    return equal, limit_rows(task, points, points - 3, torques)
+
+
+def limit_rows(task: Task, positions: int, rates: int, torques: int) -> tuple[Rows, ...]:
+    """Names of the rows of joint limits, for so many points of each."""
     names = [j.name for j in task.joints]
-    below = [Rows(f"position limit of {n}", 1.0, "rad", (points, 2)) for n in names]
-    below += [Rows(f"rate limit of {n}", r, "rad/s", (points - 3, 2)) for n, r in zip(names, task.rate_limits, strict=True)]
-    below += [Rows(f"torque limit of {n}", t, "N m", (torques, 2)) for n, t in zip(names, task.torque_limits, strict=True)]
-    return equal, tuple(below)
+    return (
+        *(Rows(f"position limit of {n}", 1.0, "rad", (positions, 2)) for n in names),
+        *(Rows(f"rate limit of {n}", x, "rad/s", (rates, 2)) for n, x in zip(names, task.rate_limits, strict=True)),
+        *(Rows(f"torque limit of {n}", x, "N m", (torques, 2)) for n, x in zip(names, task.torque_limits, strict=True)),
+    )
 
 
 def data(task: Task) -> Data:
@@ -250,7 +257,7 @@ def data(task: Task) -> Data:
     ])
     v = np.stack([np.zeros(6), task.target.twist])
     tumbles = _tumbles(sdyn.family([resting, body]), q, v, horizon)
-    waiting, target = (jax.tree.map(lambda a: a[k], tumbles) for k in range(2))
+    waiting, target = (jax.tree.map(operator.itemgetter(k), tumbles) for k in range(2))
     w = task.weights
     return Data(
         sdyn.family([chaser, task.compound]),
@@ -288,7 +295,7 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
     out = [PhaseResult("wait", task.chaser, waiting, *state, free(0 * still[0]), (task.body, *target))]
     for name, at in zip(MOVING, motions, strict=True):
         at = jax.tree.map(np.asarray, at)
-        q = np.hstack([at.p, _quaternions(at.R), at.q])
+        q = np.hstack([at.p, path_quaternions(at.R), at.q])
         passive = None if name == "stabilise" else (task.body, *_states(data.target, at.times))
         robot = task.compound if name == "stabilise" else task.chaser
         out.append(PhaseResult(name, robot, at.times, q, at.v, free(at.tau), passive))
@@ -308,10 +315,10 @@ def _tumbled(body, times):
 def _states(body, times):
     """q [k, 7] and v [k, 6] of a drifting rigid body."""
     R, p, v = map(np.asarray, _tumbled(body, jnp.asarray(times)))
-    return np.hstack([p, _quaternions(R)]), v
+    return np.hstack([p, path_quaternions(R)]), v
 
 
-def _quaternions(R):
+def path_quaternions(R):
     """Unit quaternions [k, 4] along a path of rotations, without jumps of sign."""
     quat = np.asarray(jax.jit(jax.vmap(floating.quaternion))(jnp.asarray(R)))
     turn = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
@@ -359,7 +366,7 @@ def results(task: Task, problem: Problem, x: dict) -> dict:
     return {"durations_s": dict(zip(task.phases, map(float, x["durations"]), strict=True))}
 
 
-def sentence(x: dict, state) -> str:
+def sentence(x: dict, info: dict) -> str:
     """The verdict on a solved plan."""
     wait, approach, track, stabilise = x["durations"]
     return (

@@ -10,7 +10,7 @@ import optax
 import sdyn
 from planners import floating, grasp
 from planners.problem import Form
-from planners.sqp import violation
+from planners.sqp import merit
 from planners.task import Task
 
 TIMES, POSTURES = 12, 8  # candidates of the grasp's time, and random postures for each
@@ -92,19 +92,23 @@ def _descend(form: Form, z, numbers):
     data, lower, upper = numbers
     adam = optax.adam(optax.cosine_decay_schedule(DESCENT[1], DESCENT[0]))
 
-    def merit(z):
-        v = form.at(z, data)
-        return v.cost + PENALTY * violation(v.equal, v.below)[0]
+    value = lambda z: merit(form, z, data, PENALTY)[0]
 
     def step(carry, _):
         z, state = carry
-        move, state = adam.update(jax.grad(merit)(z), state)
+        move, state = adam.update(jax.grad(value)(z), state)
         return (jnp.clip(z + move, lower, upper), state), None
 
     (z, _), _ = jax.lax.scan(step, (z, adam.init(z)), None, length=DESCENT[0])
-    return z, merit(z)
+    return z, value(z)
 
 
 def improve(form: Form, z, numbers):
     """Guesses [seeds, n] (scaled) after a descent on the cost with an l1 penalty, and their merits [seeds]."""
     return jax.vmap(_descend, (None, 0, None))(form, z, numbers)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def merits(form: Form, z, numbers):
+    """Merits [seeds] of guesses [seeds, n] (scaled): cost and l1 penalty."""
+    return jax.lax.map(lambda z: merit(form, z, numbers[0], PENALTY)[0], z)

@@ -69,6 +69,17 @@ def named_numbers():
     return field(default_factory=dict, metadata={"check": check})
 
 
+def names():
+    """A field that holds a list of names."""
+
+    def check(value, where):
+        if not isinstance(value, list) or not all(isinstance(x, str) for x in value):
+            raise TaskError(f'{where} is {value!r}; it must look like ["joint1", "joint2"].')
+        return tuple(value)
+
+    return field(default=(), metadata={"check": check})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Chaser:
     """Section [robot]: who does it, and how it starts, at rest."""
@@ -78,8 +89,8 @@ class Chaser:
     frame: str = text(default="hand")
     joints: dict = named_numbers()
     """Joint positions at the start [rad or m]; zero where not named."""
-    lock: dict = named_numbers()
-    """Joints that do not move, and where they stand [rad or m]."""
+    moving: tuple = names()
+    """Joints that move; all of them if left out. The others are locked where `joints` has them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +240,13 @@ class Task:
     @property
     def start(self) -> np.ndarray:
         """Joint positions at the start, [joints]."""
-        return self.chaser.configuration(self.robot.joints)[7:]
+        return self.first[7:]
+
+    @property
+    def first(self) -> np.ndarray:
+        """Configuration at time zero, [nq]: the base at the world's origin."""
+        moving = {joint.name for joint in self.joints}
+        return self.chaser.configuration({k: x for k, x in self.robot.joints.items() if k in moving})
 
 
 def load(path_or_name) -> Task:
@@ -323,7 +340,14 @@ def _model(name, folder):
 
 
 def _chaser(section, folder):
-    return _model(section.model, folder).lock(section.lock)
+    robot = _model(section.model, folder)
+    for name in (*section.moving, *section.joints):
+        robot.joint(name)
+    still = [j for j in robot.moving if section.moving and j.name not in section.moving]
+    several = [j.name for j in still if j.dof != 1 and j.name not in section.joints]
+    if several:
+        raise TaskError(f"joint {several[0]!r} has several degrees of freedom; a task cannot lock it.")
+    return robot.lock({j.name: section.joints.get(j.name, 0.0) for j in still})
 
 
 def _checked(task, folder):
@@ -333,7 +357,7 @@ def _checked(task, folder):
         raise TaskError(f"[robot] model {task.robot.model!r} must have a free base and joints.")
     several = [j.name for j in chaser.moving if j.dof != 1]
     if several:
-        raise TaskError(f"joint {several[0]!r} has several degrees of freedom; lock it in [robot], planners take one.")
+        raise TaskError(f"joint {several[0]!r} has several degrees of freedom; planners take joints with one: leave it out of moving in [robot].")
     for j, (lo, hi), q in zip(chaser.moving, task.position_limits, task.start, strict=True):
         if not lo <= q <= hi:
             raise TaskError(f"[robot] joints: {j.name!r} starts at {q:g}, outside its limits {lo:g} to {hi:g}.")
