@@ -55,6 +55,8 @@ def by_step(slot_index, x):
 
 def by_dof(slot_index, x, nv: int):
     """The inverse of `by_step`: (T, W, B) -> (nv, B)."""
+    if nv == 0:  # the transpose of a scatter into nothing is a gather that JAX refuses
+        return jnp.zeros((0, x.shape[-1]), x.dtype)
     live = jnp.where(slot_index[SlotRow.LIVE][..., None] == 1, x, 0)
     return jnp.zeros((nv, x.shape[-1]), x.dtype).at[slot_index[SlotRow.DOF]].add(live)[:nv]
 
