@@ -150,10 +150,16 @@ def _place_camera(camera, low, high):
     """Look at the middle of a box across its longer side, a little from above, and far enough to see all of it."""
     middle, half = (low + high) / 2, (high - low) / 2
     aside = np.array([0.0, -1.0, 0.0]) if half[0] >= half[1] else np.array([1.0, 0.0, 0.0])
-    view = aside + np.array([0.35, 0.2, 0.45])
+    back = aside + np.array([0.35, 0.2, 0.45])
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    corners = half * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     camera.fov = np.radians(40.0)
+    slope = 0.95 * np.tan(camera.fov / 2)  # of the upper edge of what is seen; the window is wider than high
+    across, up, near = (np.abs(corners @ right) / 1.3, np.abs(corners @ np.cross(back, right)), corners @ back)
     camera.look_at = middle
-    camera.position = middle + 0.65 * np.linalg.norm(half) / np.sin(camera.fov / 2) * view / np.linalg.norm(view)
+    camera.position = middle + np.max(np.maximum(across, up) / slope + near) * back
 
 
 def _build(scene, shapes, parents) -> dict:

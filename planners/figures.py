@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 import sdyn
 from planners.motion import continuous, follow, quaternions
 
-BLUE, RED, GREEN, PURPLE, INK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#222222"  # Okabe and Ito's palette
+BLUE, RED, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#A0A0A0"  # Okabe and Ito's palette
 BANDS = ("#E8E8E8", "#DCEBF7", "#FCE9CF", "#DDF1E7", "#F4E3EE")
 FAR = 5.0  # a limit this many times beyond the curve is named, not drawn
 
@@ -35,6 +35,8 @@ def draw(plan, folder) -> list[Path]:
     figures |= {"base": base(plan, motions), "momentum": momenta(plan, motions)}
     if plan.task.kind == "grasp":
         figures["grasp"] = grasp(plan, motions)
+    if plan.task.kind == "identify":
+        figures |= {"gyro": gyro(plan, motions), "information": information(plan)}
     paths = []
     for name, figure in figures.items():
         paths.append(folder / f"{name}.png")
@@ -142,15 +144,15 @@ def base(plan, motions) -> Figure:
 def momenta(plan, motions) -> Figure:
     """Momentum of the chaser, of the target and of both, about the world's origin."""
     caught = {link.name for _, target in motions if target for link in target.robot.links}
-    lines = {"chaser": BLUE, "target": RED, "total": INK} if caught else {"total": INK}
+    lines = {"chaser": BLUE, "target": RED, "total": GREY} if caught else {"total": GREY}
     figure, panels = _sheet(
         plan, "Momentum, world axes, angular about the origin", 6, columns=3, height=2.3, lines=lines
     )
     for phase, pair in zip(plan.phases, motions, strict=True):
         for name, values in shares(pair, caught).items():
             for panel, column in zip(panels, (3, 4, 5, 0, 1, 2), strict=True):
-                style = {"color": lines[name], "linewidth": 2.4 if name == "total" else 1.3}
-                panel.plot(phase.times, values[:, column], **style, alpha=0.6 if name == "total" else 1.0)
+                under = {"linewidth": 4.0, "zorder": 1.5} if name == "total" else {"linewidth": 1.3}
+                panel.plot(phase.times, values[:, column], color=lines[name], **under)
     for panel, axis in zip(panels, "xyzxyz", strict=True):
         panel.set_title(axis, fontsize=9, loc="left")
     panels[0].set_ylabel("linear, N s", fontsize=8)
@@ -211,6 +213,56 @@ def separation(task, robot, target) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return tuple(np.linalg.norm(x, axis=1) for x in (gap, turn, relative[:, 3:], relative[:, :3]))
 
 
+# -- identify ----------------------------------------------------------------------------------------------------------
+
+
+def gyro(plan, motions) -> Figure:
+    """What a gyro on the base reads, without its noise; the noise of one sample is a grey band about zero."""
+    noise, name = plan.task.sensors.gyro, plan.phases[0].robot.base
+    title = f"Gyro on {name!r}, base axes" + (f"; grey: its noise, {noise:g} rad/s" if noise else "")
+    figure, panels = _sheet(plan, title, 3, columns=1)
+    for phase, (robot, _) in zip(plan.phases, motions, strict=True):
+        R, _, twist = robot.of(sdyn.Frame("gyro", name))
+        for panel, values in zip(panels, np.einsum("kji,kj->ik", R, twist[:, :3]), strict=True):
+            panel.plot(phase.times, values, color=BLUE, linewidth=1.3)
+    for panel, axis in zip(panels, "xyz", strict=True):
+        panel.axhspan(-(noise or 0.0), noise or 0.0, color=GREY, alpha=0.6, linewidth=0)
+        panel.set_title(axis, fontsize=9, loc="left")
+        panel.set_ylabel("rad/s", fontsize=8)
+    return figure
+
+
+def information(plan) -> Figure:
+    """How well the manoeuvre tells the parameters: standard deviations, and singular values of the information."""
+    found = plan.info["results"]
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    deviations = found.get("sigma_percent")
+    if deviations:
+        bars = left.barh(list(deviations), list(deviations.values()), color=BLUE)
+        left.bar_label(bars, fmt="%.2g", padding=3, fontsize=8)
+        left.set_xscale("log")
+        left.margins(x=0.15)
+        left.invert_yaxis()
+    else:
+        left.set_axis_off()
+        left.text(0.0, 0.5, found["subspace"], wrap=True, fontsize=9)
+    left.set_title("Standard deviation of each parameter (Cramer-Rao), %", fontsize=9, loc="left")
+    values = found["singular_values"]
+    right.semilogy(range(1, len(values) + 1), values, "o", color=BLUE)
+    right.set_xticks(range(1, len(values) + 1))
+    right.set_title("Singular values of the scaled measurements", fontsize=9, loc="left")
+    right.set_xlabel("direction", fontsize=8)
+    for panel in (left, right):
+        panel.tick_params(labelsize=8)
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.suptitle("Information about the base", fontsize=12, x=0.01, ha="left", fontweight="bold")
+    return figure
+
+
+# -- layout ------------------------------------------------------------------------------------------------------------
+
+
 def rotation_vectors(R: np.ndarray) -> np.ndarray:
     """Rotation vectors [k, 3] (rad) of rotation matrices [k, 3, 3], without jumps along k."""
     q = continuous(quaternions(R))
@@ -218,9 +270,6 @@ def rotation_vectors(R: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
     angle = 2.0 * np.arctan2(size, q[:, :1])
     return np.where(size > 1e-12, angle / np.maximum(size, 1e-300), 2.0) * q[:, 1:]
-
-
-# -- layout ------------------------------------------------------------------------------------------------------------
 
 
 def _sheet(plan, title, count, *, columns=None, height=1.7, lines=None, dashed=None):

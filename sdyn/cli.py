@@ -7,6 +7,7 @@ Exit codes: 0 done, 1 not possible or something is wrong (one sentence on stderr
 
 import os
 import sys
+import zipfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
@@ -74,18 +75,18 @@ def main(argv: list[str] | None = None) -> int:
 def plan(
     task: TaskWord,
     out: Folder = None,
-    solver: Literal["sqp", "casadi", "riccati"] = "sqp",
+    solver: Annotated[str, arg(metavar="NAME")] = "sqp",
     seeds: int = 1,
-    accuracy: Annotated[str | None, arg(metavar="NAME")] = None,
+    accuracy: Literal["draft", "standard", "fine"] = "standard",
 ) -> int:
     """Plan a task, certify the result, and write it with figures and an animation.
 
     Args:
         task: A shipped task (grasp, identify), or the path of a .toml file.
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
-        solver: Which solver.
+        solver: Which solver; this version has sqp.
         seeds: How many starting points to improve at once; the best result is kept.
-        accuracy: A preset of accuracy, instead of the task's own.
+        accuracy: How fine the solver's grid is: half of the task's intervals, as many, or twice as many.
     """
     planners = _planners()
     wanted = planners.load(task)
@@ -241,7 +242,11 @@ def _planners():
 def _plan_in(folder: Path):
     if not (folder / "plan.npz").is_file():
         raise Failure(f"{folder} holds no plan (plan.npz); make one with: sdyn plan TASK --out {folder}")
-    return _planners().Plan.load(folder)
+    planners = _planners()
+    try:
+        return planners.Plan.load(folder)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise Failure(f"the plan in {folder} cannot be read ({error}); make it again with: sdyn plan TASK") from None
 
 
 def _check_plan(folder) -> int:

@@ -41,7 +41,7 @@ def test_help_fits_80_columns(argv, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "argv", [["shw"], ["plan"], ["plan", "grasp", "--seeds", "many"], ["plan", "x", "--solver", "y"]]
+    "argv", [["shw"], ["plan"], ["plan", "grasp", "--seeds", "many"], ["bench", "x"]]
 )
 def test_wrong_usage_is_exit_code_2(argv, capsys):
     assert main(argv) == 2
@@ -263,6 +263,15 @@ def test_view_and_check_of_a_folder_without_a_plan(tmp_path, capsys):
     assert "holds no plan" in sentence(capsys)
     assert main(["check", str(tmp_path)]) == 1
     assert "holds no plan" in sentence(capsys)
+
+
+@pytest.mark.parametrize(("npz", "json"), [(b"no zip", "{}"), (b"", "{"), (b"", None)])
+def test_a_broken_plan_is_one_sentence(npz, json, tmp_path, capsys):
+    (tmp_path / "plan.npz").write_bytes(npz)
+    if json is not None:
+        (tmp_path / "plan.json").write_text(json)
+    assert main(["check", str(tmp_path)]) == 1
+    assert "cannot be read" in sentence(capsys)
 
 
 def test_view_prints_the_page(tmp_path, capsys):
