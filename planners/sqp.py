@@ -21,6 +21,7 @@ from planners.problem import Form, Linear
 
 FEASIBLE = 1e-9  # scaled violation
 STATIONARY = 1e-6  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
+ENOUGH = 1e-4  # the same, where rounding lets nothing more be gained
 PENALTIES = (10.0, 1e5)  # first and largest
 LENGTHS = 0.5 ** np.arange(8.0)
 WORTH = 0.1  # part of the predicted decrease that a step must bring
@@ -197,4 +198,6 @@ def _status(s: State) -> str:
         return "solved"
     if s.idle < PATIENCE:
         return "running"
-    return "not converged" if feasible else "infeasible"
+    if not feasible:
+        return "infeasible"
+    return "solved" if s.stationarity <= ENOUGH else "not converged"

@@ -376,4 +376,5 @@ def _checked(task, folder):
     if body.grounded or body.moving:
         raise TaskError(f"[target] model {task.target.model!r} must be one free rigid body; lock its joints.")
     body.frame(task.target.frame)
+    body.configuration(quaternion=task.target.quaternion)  # refuses one that has not unit length
     return replace(task, body=body.prefixed("target_"))
