@@ -156,7 +156,7 @@ def _place_camera(camera, low, high):
     right = right / np.linalg.norm(right)
     corners = half * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     camera.fov = np.radians(40.0)
-    slope = 0.95 * np.tan(camera.fov / 2)  # of the upper edge of what is seen; the window is wider than high
+    slope = 1.15 * np.tan(camera.fov / 2)  # of what is seen above the middle; the box is roomy, the window wide
     across, up, near = (np.abs(corners @ right) / 1.3, np.abs(corners @ np.cross(back, right)), corners @ back)
     camera.look_at = middle
     camera.position = middle + np.max(np.maximum(across, up) / slope + near) * back
@@ -195,7 +195,7 @@ def _add(scene, name, shape):
 
 def _labels(scene, plan, middle, top) -> list:
     """A label for each phase, above the scene; it is shown in its phase only."""
-    look = {"position": (*middle, top), "anchor": "top-center", "font_screen_scale": 1.5, "visible": False}
+    look = {"position": (*middle, top), "anchor": "bottom-center", "font_screen_scale": 1.5, "visible": False}
     spans = [f"{phase.name}, {phase.times[0]:.1f} to {phase.times[-1]:.1f} s" for phase in plan.phases]
     return [scene.add_label(f"/phase {k}", text, **look) for k, text in enumerate(spans)]
 

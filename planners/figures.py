@@ -142,14 +142,15 @@ def base(plan, motions) -> Figure:
 
 
 def momenta(plan, motions) -> Figure:
-    """Momentum of the chaser, of the target and of both, about the world's origin."""
+    """Momentum of the chaser and of the target, or of the base and of the other links, and in total."""
     caught = {link.name for _, target in motions if target for link in target.robot.links}
-    lines = {"chaser": BLUE, "target": RED, "total": GREY} if caught else {"total": GREY}
+    base = plan.phases[0].robot.base
+    lines = dict(zip(shares(motions[0], caught, base), (BLUE, RED, GREY), strict=True))
     figure, panels = _sheet(
         plan, "Momentum, world axes, angular about the origin", 6, columns=3, height=2.3, lines=lines
     )
     for phase, pair in zip(plan.phases, motions, strict=True):
-        for name, values in shares(pair, caught).items():
+        for name, values in shares(pair, caught, base).items():
             for panel, column in zip(panels, (3, 4, 5, 0, 1, 2), strict=True):
                 under = {"linewidth": 4.0, "zorder": 1.5} if name == "total" else {"linewidth": 1.3}
                 panel.plot(phase.times, values[:, column], color=lines[name], **under)
@@ -160,18 +161,20 @@ def momenta(plan, motions) -> Figure:
     return figure
 
 
-def shares(pair, caught) -> dict[str, np.ndarray]:
-    """Momentum [k, 6] of the chaser, of the target and in total; of a robot alone only the total.
+def shares(pair, caught, base) -> dict[str, np.ndarray]:
+    """Momentum [k, 6] of the chaser, of the target and in total; of a robot alone, of its base and its other links.
 
     Args:
         pair: Motion of the robot, and of the target as long as it is apart.
         caught: Names of the target's links.
+        base: Name of the robot's base.
     """
     robot, target = pair
+    links = {link.name for link in robot.robot.links}
     if not caught:
-        return {"total": robot.momentum()}
-    own = robot.momentum([link.name for link in robot.robot.links if link.name not in caught])
-    other = (target or robot).momentum(caught)
+        own, other = robot.momentum([base]), robot.momentum(sorted(links - {base}))
+        return {"base": own, "other links": other, "total": own + other}
+    own, other = robot.momentum(sorted(links - caught)), (target or robot).momentum(sorted(caught))
     return {"chaser": own, "target": other, "total": own + other}
 
 
@@ -217,16 +220,15 @@ def separation(task, robot, target) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 
 
 def gyro(plan, motions) -> Figure:
-    """What a gyro on the base reads, without its noise; the noise of one sample is a grey band about zero."""
+    """What a gyro on the base reads, without its noise, which the title tells."""
     noise, name = plan.task.sensors.gyro, plan.phases[0].robot.base
-    title = f"Gyro on {name!r}, base axes" + (f"; grey: its noise, {noise:g} rad/s" if noise else "")
-    figure, panels = _sheet(plan, title, 3, columns=1)
+    title = f"Angular velocity of {name!r}, own axes" + (f"; the gyro's noise is {noise:g} rad/s" if noise else "")
+    figure, panels = _sheet(plan, title, 3)
     for phase, (robot, _) in zip(plan.phases, motions, strict=True):
         R, _, twist = robot.of(sdyn.Frame("gyro", name))
         for panel, values in zip(panels, np.einsum("kji,kj->ik", R, twist[:, :3]), strict=True):
             panel.plot(phase.times, values, color=BLUE, linewidth=1.3)
     for panel, axis in zip(panels, "xyz", strict=True):
-        panel.axhspan(-(noise or 0.0), noise or 0.0, color=GREY, alpha=0.6, linewidth=0)
         panel.set_title(axis, fontsize=9, loc="left")
         panel.set_ylabel("rad/s", fontsize=8)
     return figure
@@ -274,7 +276,7 @@ def rotation_vectors(R: np.ndarray) -> np.ndarray:
 
 def _sheet(plan, title, count, *, columns=None, height=1.7, lines=None, dashed=None):
     """A figure with `count` panels over time, the phases tinted, and one legend for all."""
-    columns = columns or (1 if count == 1 else 2 if count <= 8 else 3)
+    columns = columns or (1 if count <= 3 else 2 if count <= 8 else 3)
     rows = -(-count // columns)
     figure = Figure(figsize=(10.0, 0.9 + height * rows), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)

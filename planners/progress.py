@@ -73,7 +73,7 @@ class Live:
         self._end_stage()
         elapsed = time.monotonic() - self._start
         self._pace.append((k, elapsed, feasibility))
-        row = (k, float(cost), float(feasibility), float(step), elapsed, self._left(), seeds_alive)
+        row = (k, float(cost), float(feasibility), float(step), duration(elapsed), self._left(), seeds_alive)
         self._rows.append(row)
         if self.show and not self._live:
             self._say(row)
@@ -101,23 +101,22 @@ class Live:
 
     def _say(self, row):
         k, cost, feasibility, step, elapsed, left, _ = row
-        text = f"iteration {k}: cost {cost:#.6g}, feasibility {feasibility:.1e}, step {step:.1e}, {seconds(elapsed)}"
+        text = f"iteration {k}: cost {cost:#.6g}, feasibility {feasibility:.1e}, step {step:.1e}, {elapsed}"
         self._unsaid = text
         if len(self._pace) == 1 or time.monotonic() - self._said >= PLAIN_SECONDS:
-            self.console.print(text + (f", about {seconds(left)} left" if left else ""), soft_wrap=True)
+            self.console.print(text + (f", {left} left" if left != "-" else ""), soft_wrap=True)
             self._said, self._unsaid = time.monotonic(), None
 
-    def _left(self) -> float | None:
-        """Seconds to the end at the present pace: to the tolerance if feasibility falls steadily, else to the limit."""
+    def _left(self) -> str:
+        """Time to the tolerance at the present pace if feasibility falls; else at most to the limit, as "< 9 s"."""
         if len(self._pace) < 3:
-            return None
+            return "-"
         (k0, t0, f0), (k1, t1, f1) = self._pace[0], self._pace[-1]
-        if k1 <= k0:
-            return None
-        left = [self.limit - k1] if self.limit else []
-        if self.tolerance and 0.0 < f1 < f0:
-            left.append((k1 - k0) * math.log(max(f1 / self.tolerance, 1.0)) / math.log(f0 / f1))
-        return (t1 - t0) / (k1 - k0) * min(left) if left else None
+        most = (t1 - t0) / (k1 - k0) * (self.limit - k1) if self.limit else math.inf
+        if self.tolerance and self.tolerance < f1 < f0:
+            guess = (t1 - t0) * math.log(f1 / self.tolerance) / math.log(f0 / f1)
+            return duration(min(guess, most))
+        return f"< {duration(most)}" if self.limit else "-"
 
     def _heading(self):
         return self.title + (f" ({self.seeds} seeds)" if self.seeds > 1 else "")
@@ -135,15 +134,13 @@ class Live:
         for title in titles + (["seeds"] if self.seeds > 1 else []):
             table.add_column(title, justify="right")
         for k, cost, feasibility, step, elapsed, left, alive in self._rows:
-            cells = [str(k), f"{cost:#.6g}", f"{feasibility:.1e}", f"{step:.1e}", seconds(elapsed), seconds(left)]
+            cells = [str(k), f"{cost:#.6g}", f"{feasibility:.1e}", f"{step:.1e}", elapsed, left]
             table.add_row(*cells, *([str(self.seeds if alive is None else alive)] if self.seeds > 1 else []))
         return table
 
 
-def seconds(x: float | None) -> str:
-    """A duration to read: 0.3 s, 12 s, 3 min 05 s; "-" if unknown."""
-    if x is None:
-        return "-"
+def duration(x: float) -> str:
+    """Seconds to read: 0.3 s, 12 s, 3 min 05 s."""
     if x < 10:
         return f"{x:.1f} s"
     whole = round(x)

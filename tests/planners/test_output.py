@@ -115,14 +115,14 @@ def test_separation_is_that_of_the_frames(plan, motions):
 
 def test_momentum_is_that_of_sdyn_and_its_shares_add_up(plan, motions):
     for phase, pair in zip(plan.phases, motions, strict=True):
-        found = figures.shares(pair, {"target_target"})
+        found = figures.shares(pair, {"target_target"}, "base")
         np.testing.assert_allclose(found["chaser"] + found["target"], found["total"], atol=1e-12)
         whole, k = sdyn.pack(phase.robot), 17
         about_com, com = sdyn.momentum(whole, phase.q[k], phase.v[k]), sdyn.centre_of_mass(whole, phase.q[k])
         angular = about_com[:3] + np.cross(com, about_com[3:])
         own = found["chaser" if phase.passive else "total"]
         np.testing.assert_allclose(own[k], np.concatenate([angular, about_com[3:]]), atol=1e-11)
-    free = figures.shares(motions[0], {"target_target"})["target"]  # a free body keeps its momentum
+    free = figures.shares(motions[0], {"target_target"}, "base")["target"]  # a free body keeps its momentum
     np.testing.assert_allclose(free, np.tile(free[0], (len(free), 1)), atol=1e-12)
 
 
@@ -140,6 +140,17 @@ def test_quaternions_and_rotations_are_inverse():
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     back = motion.quaternions(motion.rotations(q))
     np.testing.assert_allclose(np.abs((q * back).sum(1)), 1.0, atol=1e-14)
+
+
+def test_figures_of_an_identification(plan, tmp_path):
+    results = {"sigma_percent": {"m": 0.2, "Ixx": 0.01}, "singular_values": [3.0, 1.0], "subspace": "all"}
+    task = SimpleNamespace(**{**vars(plan.task), "kind": "identify", "sensors": SimpleNamespace(gyro=1e-5)})
+    phase = SimpleNamespace(**{**vars(plan.phases[0]), "passive": None})
+    alone = SimpleNamespace(task=task, phases=(phase,), info={"results": results})
+    names = {path.stem for path in figures.draw(alone, tmp_path)}
+    assert {"gyro", "information", "momentum"} <= names and "grasp" not in names
+    del results["sigma_percent"]
+    assert figures.information(alone).axes[0].texts[0].get_text() == "all"
 
 
 # -- animation ---------------------------------------------------------------------------------------------------------
@@ -245,9 +256,11 @@ def test_time_left_comes_from_the_pace(monkeypatch):
     live = progress.Live("planning", show=False, iterations=100, tolerance=1e-8)
     for k in range(1, 6):
         live.iteration(k, 1.0, 10.0**-k, 0.1)
-    assert live._left() == pytest.approx(3.0)  # a power of ten each second, three to go
+    assert live._left() == "3.0 s"  # a power of ten each second, three to go
+    live.iteration(6, 1.0, 0.0, 0.1)
+    assert live._left() == "< 94 s"  # feasible: at most to the limit
 
 
-@pytest.mark.parametrize(("x", "text"), [(None, "-"), (0.31, "0.3 s"), (12.4, "12 s"), (185.0, "3 min 05 s")])
+@pytest.mark.parametrize(("x", "text"), [(0.31, "0.3 s"), (12.4, "12 s"), (185.0, "3 min 05 s")])
 def test_durations_read_well(x, text):
-    assert progress.seconds(x) == text
+    assert progress.duration(x) == text
