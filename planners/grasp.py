@@ -39,6 +39,7 @@ class Data(NamedTuple):
     rate: jax.Array  # [n]
     torque: jax.Array  # [n]
     margin: jax.Array  # [] part of the torque kept free
+    speed: jax.Array  # [] tolerance while tracking, rad/s and m/s
     weights: jax.Array  # [3] time, torque, smoothness
 
 
@@ -193,8 +194,9 @@ def residuals(data: Data, motions):
 
 @dataclass(frozen=True)
 class Grasp:
-    """Cost and constraints, for one grid, one frame of the hand, and the grid points of the tracking phase where the
-    poses must agree.
+    """Cost and constraints, for one grid, one frame of the hand, and the grid points of the tracking phase where it
+    must agree with the target in pose. Twists agree at its ends, and within half of the tolerance at all its points,
+    or the approach's last acceleration would ring through the first span.
     """
 
     grid: Grid
@@ -214,6 +216,7 @@ class Grasp:
             two_sided(jnp.concatenate(P), data.position[:, 0], data.position[:, 1]),
             two_sided(jnp.concatenate(rates), -1.0, 1.0),
             two_sided(torque, data.margin - 1, 1 - data.margin),
+            two_sided(jnp.concatenate([spin, slide], axis=1) / data.speed, -0.5, 0.5),
         )
         return Values(
             data.weights[0] * T.sum(),
@@ -233,7 +236,8 @@ def rows(task: Task, grid: Grid, poses):
         Rows(f"velocity of {hand!r} relative to {grip!r}", 1.0, "m/s", (2, 3)),
     )
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
-    return equal, limit_rows(task, points, points - 3, torques)
+    steady = Rows("velocity while tracking", task.tolerance.speed, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
+    return equal, (*limit_rows(task, points, points - 3, torques), steady)
 
 
 def limit_rows(task: Task, positions: int, rates: int, torques: int) -> tuple[Rows, ...]:
@@ -269,6 +273,7 @@ def data(task: Task) -> Data:
         jnp.asarray(task.rate_limits),
         jnp.asarray(task.torque_limits),
         jnp.asarray(task.limits.margin),
+        jnp.asarray(task.tolerance.speed),
         jnp.array([w.time, w.torque, w.smoothness]),
     )
 
@@ -326,8 +331,8 @@ def path_quaternions(R):
 
 
 def pose_points(task: Task, grid: Grid) -> np.ndarray:
-    """Grid points of the tracking phase where the poses must agree, evenly spread: with the velocities at both ends,
-    two conditions fewer than the spline has control points.
+    """Grid points of the tracking phase where the poses must agree, evenly spread: two conditions fewer than the
+    spline has control points.
     """
     return np.unique(np.round(np.linspace(0, grid.intervals[1], grid.splines[1].count - 4)).astype(int))
 

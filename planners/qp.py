@@ -4,8 +4,8 @@
     subject to  lower <= d <= upper
 
 Written with p, n >= 0 for A d + a = p - n, t >= 0 for C d + c <= t; these and the slacks are eliminated by hand, so
-each step factors one matrix of the size of d and a. It always has a solution, and every multiplier stays below the penalty:
-an infeasible linearisation shows itself as a multiplier at the penalty, not as a failure.
+each step factors one matrix of the size of d and a. It always has a solution, and every multiplier stays below the
+penalty: an infeasible linearisation shows itself as a multiplier at the penalty, not as a failure.
 
 Source: Mehrotra (1992), On the implementation of a primal-dual interior point method; Fletcher's S l1 QP.
 """

@@ -25,9 +25,10 @@ ENOUGH = 1e-4  # the same, where rounding lets nothing more be gained
 PENALTIES = (10.0, 1e5)  # first and largest
 LENGTHS = 0.5 ** np.arange(8.0)
 WORTH = 0.1  # part of the predicted decrease that a step must bring
+NOISE = 1e-10  # relative change of the merit that says nothing: steps within it are taken, or the radius would collapse
 LEARN_BELOW = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
 RADII = (1e-10, 2.0)  # smallest and largest trust region, scaled variables
-PATIENCE = 4  # iterations without progress
+PATIENCE = 8  # iterations without progress
 
 
 @dataclass(frozen=True)
@@ -134,11 +135,11 @@ def _iterate(form, s: State, data, low, high) -> State:
     near = _host(_near(form, z, data)) if length else s.near
     size = float(np.abs(d).max())
     if length == 1:
-        radius = max(s.radius, 2 * size) if gain > 0.5 * predicted else s.radius
+        radius = max(s.radius, 2 * size) if gain > 0.5 * predicted - NOISE * abs(now) else s.radius
     else:
         radius = 2 * length * size if length else LENGTHS[-1] * size
     stuck = most_left > FEASIBLE and left > 0.3 * before
-    progress = gain > 1e-13 * abs(now)
+    progress = gain > NOISE * abs(now)
     fresh = State(
         z,
         near,
@@ -158,18 +159,19 @@ def _iterate(form, s: State, data, low, high) -> State:
 def _search(form, s, d, now, predicted, numbers):
     """The next point, the length of the step (0 if none pays), and what it gains."""
     data, low, high = numbers
+    noise = NOISE * abs(now)
     gram = s.near.A @ s.near.A.T
     gram = gram + 1e-12 * max(np.trace(gram), 1e-300) * np.eye(len(gram))
     for length in LENGTHS:
         straight = s.z + length * d
         value, equal = _host(_merit(form, straight, data, s.penalty))
-        if now - value > WORTH * length * predicted:
+        if now - value > WORTH * length * predicted - noise:
             return straight, length, now - value
         if np.isfinite(equal).all():
             unseen = equal - (1 - length) * s.near.equal
             bent = np.clip(straight - s.near.A.T @ np.linalg.solve(gram, unseen), low, high)
             value, _ = _host(_merit(form, bent, data, s.penalty))
-            if now - value > WORTH * length * predicted:
+            if now - value > WORTH * length * predicted - noise:
                 return bent, length, now - value
     return s.z, 0.0, 0.0
 
