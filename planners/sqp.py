@@ -2,7 +2,8 @@
 
 Each iteration solves one elastic programme (`qp`) in a box around the point. The curvature is Gauss-Newton plus a
 symmetric rank-one correction that learns, from short steps, what Gauss-Newton leaves out (the constraints'
-curvature); negative directions are mirrored. A step that does not pay is first bent (second-order correction), then shortened.
+curvature); negative directions are mirrored. A step that does not pay is first bent (second-order correction), then
+shortened.
 
 The loop runs on the host, so that it can be watched; three compiled functions do the work.
 Source: Fletcher's S l1 QP; Nocedal and Wright, Numerical Optimization, chapters 6 and 18.
@@ -85,7 +86,7 @@ _subproblem = jax.jit(subproblem)
 
 def compile_all(form: Form, z, numbers) -> None:
     """Compiles what `solve` calls, side by side."""
-    data, low, high = numbers
+    data = numbers[0]
     shape = jax.eval_shape(form.near, jnp.asarray(z), data)
     near = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
     size = jnp.eye(len(z))
