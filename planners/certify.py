@@ -59,7 +59,7 @@ class Certificate:
         touched = f"; it touches {', '.join(self.active)}" if self.active else ""
         if bad:
             return f"Not certified: {'; '.join(bad)}."
-        return f"Certified: {len(self.rows)} checks passed on a grid ten times finer than the solver's{touched}."
+        return f"Certified: {len(self.rows)} checks passed on a grid twelve times finer than the solver's{touched}."
 
     def __str__(self) -> str:
         width = max(len(row.name) for row in self.rows)
@@ -165,8 +165,10 @@ def _integration(plan):
     capacity = sdyn.capacity([phase.robot for phase in plan.phases])
     longest = max(len(phase.times) for phase in plan.phases) // 2
     for phase in plan.phases:
-        qs, vs = _again(phase, capacity, longest)
-        q, v = phase.q[::2], phase.v[::2]
+        (qs, vs), (coarse_q, coarse_v) = (_again(phase, capacity, longest, stride) for stride in (2, 4))
+        # what RK4 errs by falls 16 times from one to the other: to step zero, by Richardson
+        qs, vs = qs[::2] + (qs[::2] - coarse_q) / 15, vs[::2] + (vs[::2] - coarse_v) / 15
+        q, v = phase.q[::4], phase.v[::4]
         turn = 2 * np.sqrt(np.maximum(0.0, _quat_distance(qs[:, 3:7], q[:, 3:7])))
         parts = (qs[:, :3] - q[:, :3], turn, qs[:, 7:] - q[:, 7:], vs - v)
         worst = {k: max(x, float(np.abs(part).max())) for (k, x), part in zip(worst.items(), parts, strict=True)}
@@ -179,16 +181,16 @@ def _quat_distance(a, b):
     return np.minimum(np.sum((a - b) ** 2, axis=1), np.sum((a + b) ** 2, axis=1))
 
 
-def _again(phase, capacity, longest):
-    """One phase integrated with steps of two intervals; padded with steps of no length to share one program."""
+def _again(phase, capacity, longest, stride):
+    """One phase integrated with steps of `stride` intervals; padded with steps of no length to share one program."""
     chain = sdyn.pack(phase.robot, capacity)
-    count = len(phase.times) // 2
+    count = len(phase.times) // stride
     pad = lambda x: np.concatenate([x, np.zeros((longest - count, *x.shape[1:]))])
-    tau = np.stack([phase.tau[:-1:2], phase.tau[1::2], phase.tau[2::2]], axis=1)
+    tau = np.stack([phase.tau[k : k + stride * count : stride] for k in (0, stride // 2, stride)], axis=1)
     q, v = sdyn.pad(chain, phase.q[0], phase.v[0])
     width = np.shape(v)[-1] - tau.shape[-1]
     tau = np.pad(tau, ((0, 0), (0, 0), (0, width)))
-    qs, vs = integrate(chain, q, v, pad(tau), pad(np.diff(phase.times[::2])))
+    qs, vs = integrate(chain, q, v, pad(tau), pad(np.diff(phase.times[::stride])))
     return np.asarray(qs)[: count + 1, : phase.q.shape[1]], np.asarray(vs)[: count + 1, : phase.v.shape[1]]
 
 

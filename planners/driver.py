@@ -15,7 +15,7 @@ from planners.plan import Plan
 from planners.task import Task, TaskError
 
 ACCURACIES = {"draft": 0.5, "standard": 1.0, "fine": 2.0}  # multiples of the task's intervals
-FINE = 10  # the output's grid, relative to the solver's
+FINE = 12  # the output's grid, relative to the solver's; a multiple of 4 for the certificate
 ITERATIONS = 150
 
 
@@ -88,7 +88,7 @@ def _result(task, problem, module, state, history, options):
         "stationarity": state.stationarity,
         "results": module.results(task, problem, x),
     }
-    phases = module.phases(task, problem.data, x, round(FINE * fine))
+    phases = module.phases(task, problem.data, x, round(FINE * max(fine, 1.0)))
     multipliers = {"equal": np.asarray(state.y), "below": np.asarray(state.u)}
     verdict = _verdict(problem, state, x, module, info)
     return Plan(task, phases, state.status, verdict, x, multipliers, history, {}, info)

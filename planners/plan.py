@@ -1,5 +1,6 @@
 """Plans: what a planner found, kept as plain arrays, saved and loaded."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -97,7 +98,8 @@ class Plan:
         said = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         with np.load(folder / "plan.npz", allow_pickle=False) as file:
             arrays = dict(file)
-        task = parse(said["task"]["text"], said["task"]["name"], Path(said["task"]["folder"]))
+        place = {"folder": Path(said["task"]["folder"])} if said["task"]["folder"] else {}
+        task = parse(said["task"]["text"], said["task"]["name"], **place)
         part = lambda key: {k[len(key) + 1 :]: x for k, x in arrays.items() if k.startswith(key + ".")}
         plan = cls(
             task,
@@ -135,13 +137,19 @@ def _description(plan):
             "kind": task.kind,
             "sha256": task.sha256,
             "text": task.source,
-            "folder": str(task.folder),
+            "folder": str(task.folder) if task.reads_files else None,
+            "robots": {robot.name: _hash(robot) for robot in (task.chaser, task.body) if robot is not None},
         },
         "status": plan.status,
         "verdict": plan.verdict,
         "timing": plan.timing,
         "info": plan.info,
     }
+
+
+def _hash(robot) -> str:
+    """SHA-256 of everything a robot is."""
+    return hashlib.sha256(repr(robot).encode()).hexdigest()
 
 
 def _phase(task, name, arrays):

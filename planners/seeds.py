@@ -66,9 +66,8 @@ def guesses(task: Task, data: grasp.Data, grid: grasp.Grid, count: int, seed: in
     need = np.maximum(need, 2.0 * np.abs(q - before).max(axis=1) / task.rate_limits.min())
     late = np.maximum(need - (times - tracking), 0.0)
     order = np.argsort(100 * np.maximum(miss - 1e-6, 0) + late + 0.1 * times + 0.1 * need, kind="stable")
-    return [
-        _guess(task, grid, times[k], tracking, np.clip(need[k], low[1], high[1]), before[k], q[k]) for k in order[:count]
-    ]
+    approach = np.clip(need, low[1], high[1])
+    return [_guess(task, grid, times[k], tracking, approach[k], before[k], q[k]) for k in order[:count]]
 
 
 def _guess(task, grid, time, tracking, approach, before, q):

@@ -30,6 +30,7 @@ NOISE = 1e-10  # relative change of the merit that says nothing: steps within it
 LEARN_BELOW = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
 RADII = (1e-10, 2.0)  # smallest and largest trust region, scaled variables
 PATIENCE = 8  # iterations without progress
+STALLED = 20  # iterations at the largest penalty in which the violation does not fall by a hundredth: infeasible
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class State:
     step: float = 0.0  # largest entry of the last step
     stationarity: float = np.inf
     idle: int = 0  # iterations in a row without progress
+    least: float = np.inf  # smallest total violation so far
+    stalled: int = 0  # iterations in a row, at the largest penalty, without a smaller one
     status: str = "running"  # then "solved", "infeasible" or "not converged"
 
     @property
@@ -141,6 +144,8 @@ def _iterate(form, s: State, data, low, high) -> State:
         radius = 2 * length * size if length else LENGTHS[-1] * size
     stuck = most_left > FEASIBLE and left > 0.3 * before
     progress = gain > NOISE * abs(now)
+    after = float(violation(near.equal, near.below)[0])
+    falls = after < 0.99 * s.least or s.penalty < PENALTIES[1]
     fresh = State(
         z,
         near,
@@ -153,6 +158,8 @@ def _iterate(form, s: State, data, low, high) -> State:
         float(np.abs(z - s.z).max()),
         _stationarity(near, y, u, z, low, high),
         0 if progress or (stuck and s.penalty < PENALTIES[1]) else s.idle + 1,
+        min(s.least, after),
+        0 if falls else s.stalled + 1,
     )
     return replace(fresh, status=_status(fresh))
 
@@ -199,7 +206,7 @@ def _status(s: State) -> str:
     feasible = s.violation <= FEASIBLE
     if feasible and s.stationarity <= STATIONARY:
         return "solved"
-    if s.idle < PATIENCE:
+    if s.idle < PATIENCE and (feasible or s.stalled < STALLED):
         return "running"
     if not feasible:
         return "infeasible"

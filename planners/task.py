@@ -87,7 +87,7 @@ class Chaser:
     model: str = text()
     """A shipped model, or the path of a robot file next to the task."""
     frame: str = text(default="hand")
-    joints: dict = named_numbers()
+    joints: dict = named_numbers()  # noqa: RUF009  (a field, as its neighbours)
     """Joint positions at the start [rad or m]; zero where not named."""
     moving: tuple = names()
     """Joints that move; all of them if left out. The others are locked where `joints` has them."""
@@ -116,7 +116,7 @@ class Phase:
     control_points: int = number(7, 60, default=12, whole=True)
     """Of the quintic spline of every joint."""
     intervals: int = number(4, 400, default=24, whole=True)
-    """Of the solver's grid; the certificate's is ten times finer."""
+    """Of the solver's grid; the certificate's is twelve times finer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,6 +209,12 @@ class Task:
         return hashlib.sha256(self.source.encode()).hexdigest()
 
     @property
+    def reads_files(self) -> bool:
+        """Whether a robot comes from a file next to the task, not from the shipped ones."""
+        models = [self.robot.model] + ([self.target.model] if self.target else [])
+        return any(Path(model).suffix for model in models)
+
+    @property
     def compound(self) -> sdyn.Robot:
         """The robot after the grasp."""
         return self.chaser.attach(self.body, self.robot.frame, f"target_{self.target.frame}")
@@ -297,7 +303,9 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     _refuse_unknown(phases, PHASES[kind], "[phases]")
     sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in SECTIONS[kind].items()}
     sections["phases"] = {p: _section(phases.get(p, {}), Phase, f"[phases.{p}]") for p in PHASES[kind]}
-    return _checked(Task(name=name, kind=kind, chaser=_chaser(sections["robot"], folder), source=source, folder=folder, **sections, **extra), folder)
+    chaser = _chaser(sections["robot"], folder)
+    task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
+    return _checked(task, folder)
 
 
 def _attitude(value):
@@ -357,7 +365,10 @@ def _checked(task, folder):
         raise TaskError(f"[robot] model {task.robot.model!r} must have a free base and joints.")
     several = [j.name for j in chaser.moving if j.dof != 1]
     if several:
-        raise TaskError(f"joint {several[0]!r} has several degrees of freedom; planners take joints with one: leave it out of moving in [robot].")
+        raise TaskError(
+            f"joint {several[0]!r} has several degrees of freedom; planners take joints with one: "
+            f"leave it out of moving in [robot]."
+        )
     for j, (lo, hi), q in zip(chaser.moving, task.position_limits, task.start, strict=True):
         if not lo <= q <= hi:
             raise TaskError(f"[robot] joints: {j.name!r} starts at {q:g}, outside its limits {lo:g} to {hi:g}.")

@@ -12,7 +12,8 @@ NOTEBOOKS = sorted((pathlib.Path(__file__).parents[1] / "notebooks").glob("*.ipy
 
 def printed(notebook):
     cells = (cell for cell in notebook.cells if cell.cell_type == "code")
-    text = "".join(output.get("text", "") for cell in cells for output in cell.outputs if output.get("name") == "stdout")
+    outputs = (output for cell in cells for output in cell.outputs if output.get("name") == "stdout")
+    text = "".join(output["text"] for output in outputs)
     return re.sub(r"\d\.?\d*e-1\d", "tiny", text)
 
 

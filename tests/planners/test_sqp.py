@@ -26,7 +26,8 @@ def test_qp_agrees_with_scipy_and_meets_the_optimality_conditions(sizes):
     value = lambda d: float(q.g @ d + d @ q.H @ d / 2)
     rules = [{"type": "eq", "fun": lambda d: np.asarray(q.A @ d + q.a)}] if sizes[1] else []
     rules += [{"type": "ineq", "fun": lambda d: -np.asarray(q.C @ d + q.c)}] if sizes[2] else []
-    other = minimize(value, np.zeros(sizes[0]), method="SLSQP", constraints=rules, options={"ftol": 1e-13, "maxiter": 500})
+    options = {"ftol": 1e-13, "maxiter": 500}
+    other = minimize(value, np.zeros(sizes[0]), method="SLSQP", constraints=rules, options=options)
     assert value(d) <= other.fun + 1e-6 * (1 + abs(other.fun))
 
 
