@@ -129,14 +129,16 @@ def test_importing_changes_nothing():
 
 TIMED = """
 import time
-import jax
 start = time.perf_counter()
+import jax
+middle = time.perf_counter()
 import sdyn
-print(time.perf_counter() - start)
+print(middle - start, time.perf_counter() - middle)
 """
 
 
 def test_importing_is_quick():
-    """At most 0.3 s more than importing jax: the least of several fresh processes, since other work may slow one."""
-    least = min(float(python(TIMED)) for _ in range(3))
-    assert least <= 0.3, f"{least:.2f} s"
+    """At most 0.3 s more than importing jax, or a fifth of that import where the machine is slow or busy."""
+    times = [[float(x) for x in python(TIMED).split()] for _ in range(3)]
+    alone, more = min(times, key=lambda x: x[1])
+    assert more <= max(0.3, alone / 5), f"{more:.2f} s more than {alone:.2f} s"  # measured 0.23 s more than 3.4 s, busy
