@@ -1,5 +1,7 @@
 """Parameters and lock values of a chain: replaced on the device as on the host, and differentiated."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,7 @@ LOCKS = {"joint2": 0.7, "joint5": -0.4}
 
 @pytest.fixture(scope="module")
 def accelerate():
-    return jax.jit(lambda *x: sdyn.forward_dynamics(*x))  # a function of its own: jit counts programs per function
+    return jax.jit(partial(sdyn.forward_dynamics))  # a function of its own: jit counts programs per function
 
 
 def state(robot):
