@@ -7,7 +7,7 @@ from planners.task import FOLDER, parse
 GRASP = (FOLDER / "grasp.toml").read_text()
 
 
-@pytest.mark.parametrize("name", ["grasp", "identify", "grasp_planar"])
+@pytest.mark.parametrize("name", ["grasp", "identify"])
 def test_shipped_tasks_load(name):
     task = planners.load(name)
     assert task.name == name and len(task.joints) == len(task.rate_limits) == len(task.start)
@@ -74,4 +74,4 @@ def test_a_file_or_name_that_is_not_there_is_named(tmp_path):
                                                ({"accuracy": "best"}, "'draft'")])  # fmt: skip
 def test_bad_options_are_refused(option, words):
     with pytest.raises(planners.TaskError, match=words):
-        planners.plan(planners.load("grasp_planar"), progress=False, **option)
+        planners.plan(planners.load("grasp"), progress=False, **option)
