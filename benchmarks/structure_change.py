@@ -1,4 +1,6 @@
-"""What one change of structure of the 37-DOF robot costs: edit, pack, and the one transfer to the device.
+"""What one change of structure costs on the host, edit and pack, and the one copy to the device apart.
+
+The 37-DOF robot, and what it costs to pack chains and bushes of up to 1000 joints.
 
     python benchmarks/structure_change.py
 
@@ -17,6 +19,7 @@ import jax
 import numpy as np
 
 import sdyn
+from sdyn.pack import _arrays  # `pack` without the copy to the device
 
 REPEATS = 200
 RESULT = Path(__file__).parent / "results" / "structure_change.json"
@@ -34,17 +37,35 @@ def edits(paper):
     }
 
 
-def timed(edit, capacity):
-    """Seconds of each repeat: (edit and pack, pack alone)."""
+def timed(edit, capacity, repeats=REPEATS):
+    """Milliseconds of each repeat: edit, pack, copy to the device."""
     rows = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
+    for _ in range(repeats):
+        times = [time.perf_counter()]
         robot = edit()
-        middle = time.perf_counter()
-        jax.block_until_ready(sdyn.pack(robot, capacity))
-        end = time.perf_counter()
-        rows.append((end - start, end - middle))
-    return np.array(rows).T
+        times.append(time.perf_counter())
+        arrays = _arrays(robot, capacity, np.dtype("float64"))
+        times.append(time.perf_counter())
+        jax.block_until_ready(jax.device_put(arrays))
+        times.append(time.perf_counter())
+        rows.append(np.diff(times))
+    return 1e3 * np.array(rows)
+
+
+def long_robots(joints=1000):
+    """A chain and a bush of many joints."""
+    links = [sdyn.Link(f"l{k}", 1.0, (0, 0, 0.05), 0.01 * np.eye(3)) for k in range(joints + 1)]
+    place = dict(position=(0, 0, 0.1), axis=(1, 0, 0))
+    hang = lambda parent: [
+        sdyn.Joint(f"j{k}", "revolute", f"l{parent(k)}", f"l{k + 1}", **place) for k in range(joints)
+    ]
+    return {"chain": sdyn.Robot(links, hang(lambda k: k)), "bush": sdyn.Robot(links, hang(lambda k: 0))}
+
+
+def row(host, **rest):
+    """Median, spread and best of the time on the host."""
+    low, median, high = np.percentile(host, (10, 50, 90))
+    return dict(host_median_ms=median, host_p10_ms=low, host_p90_ms=high, host_least_ms=host.min(), **rest)
 
 
 def main():
@@ -56,20 +77,22 @@ def main():
         lambda event, seconds, **rest: compiled.append(event) if "compile" in event else None
     )
     for name, edit in edits(paper).items():
-        both, alone = timed(edit, capacity) * 1e3
-        low, median, high = np.percentile(both, (10, 50, 90))
-        rows[name] = dict(
-            median_ms=median,
-            p10_ms=low,
-            p90_ms=high,
-            least_ms=both.min(),
-            pack_median_ms=np.median(alone),
-            repeats=REPEATS,
+        times = timed(edit, capacity)
+        edited, packed, copied = np.median(times, 0)
+        rows[name] = row(
+            times[:, :2].sum(1), edit_median_ms=edited, pack_median_ms=packed, copy_median_ms=copied, repeats=REPEATS
         )
-        print(f"{name:20s} {median:6.2f} ms  ({low:.2f} to {high:.2f}), of which packing {np.median(alone):.2f}")
+        median, low, high, *_ = rows[name].values()
+        print(
+            f"{name:20s} {median:6.2f} ms  ({low:.2f} to {high:.2f}) on the host: edit {edited:.2f}, "
+            f"pack {packed:.2f}; copy to the device {copied:.2f}"
+        )
     print(f"compilations: {len(compiled)}")
+    long = {name: timed(lambda x=x: x, sdyn.capacity([x]), repeats=10) for name, x in long_robots().items()}
+    for name, times in long.items():
+        print(f"pack a {name} of 1000 joints: {np.median(times[:, 1]):.0f} ms")
     result = dict(
-        what="one structure change of paper37: edit, pack, transfer to the device [ms]",
+        what="one structure change of paper37 on the host: edit and pack; copy to the device apart [ms]",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         jax=jax.__version__,
         python=platform.python_version(),
@@ -79,6 +102,7 @@ def main():
         load=os.getloadavg()[0],
         compilations=len(compiled),
         edits={name: {k: round(v, 3) for k, v in row.items()} for name, row in rows.items()},
+        pack_1000_joints_ms={name: round(float(np.median(times[:, 1])), 1) for name, times in long.items()},
     )
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")

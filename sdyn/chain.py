@@ -6,9 +6,11 @@ slot `T W`, and slot `T W + 1` is a dummy that empty slots point to. Links locke
 
 import zlib
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sdyn.checks import RobotError, known
@@ -80,6 +82,27 @@ class Capacity:
     def slots(self) -> int:
         """Slots of bodies other than the base."""
         return self.steps * self.width
+
+    @cached_property
+    def numbers(self) -> dict[str, dict[str, int]]:
+        """The number of each part by its name, for "link", "joint" and "frame"."""
+        return {key: {name: k for k, name in enumerate(names)} for key, names in self._names().items()}
+
+    @cached_property
+    def hashes(self) -> dict[str, np.ndarray]:
+        """Hashes of the names, in order, for "link", "joint" and "frame".
+
+        Raises:
+            RobotError: If two parts of a sort have the same hash.
+        """
+        out = {key: np.array([name_hash(name) for name in names], np.int32) for key, names in self._names().items()}
+        for key, names in self._names().items():
+            if len(set(out[key].tolist())) < len(names):
+                raise RobotError(f"pack: two {key}s have the same hash of their names, {list(names)}; rename one.")
+        return out
+
+    def _names(self):
+        return {"link": self.link_names, "joint": self.joint_names, "frame": self.frame_names}
 
     @property
     def base_nq(self) -> int:

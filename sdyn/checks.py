@@ -30,11 +30,16 @@ def array(value, shape: tuple[int, ...], what: str) -> np.ndarray:
         raise RobotError(f"{what} has rows of different length; it must have shape {shape}.") from None
     if x.dtype.kind not in "biuf":
         raise RobotError(f"{what} must hold numbers; got {value!r}.")
-    x = x.astype(np.float64)
+    x = x.astype(np.float64, copy=False)
     if x.shape != shape:
         raise RobotError(f"{what} has shape {x.shape}; it must have shape {shape}.")
     if not np.isfinite(x).all():
         raise RobotError(f"{what} is {x.tolist()}; every entry must be finite.")
+    return read_only(x)
+
+
+def read_only(x: np.ndarray) -> np.ndarray:
+    """The array itself, which can no longer be written to."""
     x.flags.writeable = False
     return x
 

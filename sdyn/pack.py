@@ -1,9 +1,11 @@
 """The gate: a robot of names and parts becomes a chain of arrays, in NumPy until one transfer to the device."""
 
+from typing import NamedTuple
+
 import jax
 import numpy as np
 
-from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, SlotRow, name_hash
+from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, SlotRow
 from sdyn.checks import RobotError
 from sdyn.merge import derive
 from sdyn.robot import Robot
@@ -107,7 +109,7 @@ def _capacity_of(robots, width, padded) -> Capacity:
         raise RobotError(f"the width is {width}; a step holds at least one body.")
     union = lambda key: tuple(dict.fromkeys(part.name for robot in robots for part in getattr(robot, key)))
     links, joints, frames = union("links"), union("joints"), union("frames")
-    sizes = [_sizes(robot, width) for robot in robots]
+    sizes = [_sizes(robot, len(schedule(_bodies(robot).parent, width))) for robot in robots]
     steps, nq, nv, quaternions = (max(column) for column in zip(*sizes, strict=True))
     layout = "padded" if padded else "grounded" if robots[0].grounded else "free"
     return Capacity(
@@ -115,11 +117,11 @@ def _capacity_of(robots, width, padded) -> Capacity:
     )
 
 
-def _sizes(robot, width):
+def _sizes(robot, steps):
     """Steps, entries of q, of v, quaternions."""
     moving = robot.moving
     return (
-        len(schedule(_bodies(robot)[0], width)),
+        steps,
         sum(joint.nq for joint in moving),
         sum(joint.dof for joint in moving),
         sum(joint.kind == "spherical" for joint in moving),
@@ -129,16 +131,13 @@ def _sizes(robot, width):
 def _check_fits(robot, capacity, needs):
     """Refuse a robot whose names or sizes are not those of the capacity."""
     again = "make the capacity with this robot in the list"
-    for key, names in (("link", capacity.link_names), ("joint", capacity.joint_names), ("frame", capacity.frame_names)):
-        mine = [part.name for part in getattr(robot, key + "s")]
-        at = {name: k for k, name in enumerate(names)}
-        for name in mine:
-            if name not in at:
-                raise RobotError(f"pack: the capacity has no {key} {name!r}; {again}.")
-        if key == "joint" and mine != sorted(mine, key=at.get):
-            raise RobotError("pack: the robot declares its joints in another order than the capacity; keep one order.")
-        if len({name_hash(name) for name in names}) < len(names):
-            raise RobotError(f"pack: two {key}s have the same hash of their names, {list(names)}; rename one.")
+    for key, at in capacity.numbers.items():
+        for part in getattr(robot, key + "s"):
+            if part.name not in at:
+                raise RobotError(f"pack: the capacity has no {key} {part.name!r}; {again}.")
+    order = [capacity.numbers["joint"][joint.name] for joint in robot.joints]
+    if order != sorted(order):
+        raise RobotError("pack: the robot declares its joints in another order than the capacity; keep one order.")
     if capacity.layout != "padded" and (capacity.layout == "grounded") != robot.grounded:
         raise RobotError("pack: the capacity is the exact one of another robot; use sdyn.capacity([...]).")
     have = capacity.steps, capacity.nq, capacity.nv, capacity.quaternions
@@ -147,26 +146,57 @@ def _check_fits(robot, capacity, needs):
             raise RobotError(f"pack: the robot needs {need} {what} and the capacity has {room}; {again}.")
 
 
-# ---- arrays ----------------------------------------------------------------------------------------------------------
+# ---- bodies ----------------------------------------------------------------------------------------------------------
 
 
-def _bodies(robot):
-    """The tree of bodies: one per degree of freedom, links locked together in one.
+class Bodies(NamedTuple):
+    """The tree of bodies: one per degree of freedom, links locked together in one; the base is body -1."""
 
-    Returns:
-        Parent body of each body (-1 the base), (link, row of its joint's screws) of each, body of each link.
-    """
-    tree, parent, what = robot.tree, [], []
-    body = [-1] * len(robot.links)
+    parent: list[int]
+    """The body that each hangs from."""
+    link: list[int]
+    """The link whose joint it belongs to."""
+    screw: list[int]
+    """Which degree of freedom of that joint it is, counted from the base outwards."""
+    of_link: list[int]
+    """The body that each link is part of."""
+
+
+def _bodies(robot) -> Bodies:
+    tree, parent, link, screw = robot.tree, [], [], []
+    of_link = [-1] * len(robot.links)
     for i in tree.order[1:]:
-        joint = robot.joints[tree.joint[i]]
-        body[i] = body[tree.parent[i]]
-        if not robot.is_locked(joint):
-            for k in range(joint.dof):
-                parent.append(body[i])
-                what.append((i, k))
-                body[i] = len(parent) - 1
-    return parent, what, body
+        j = tree.joint[i]
+        of_link[i] = of_link[tree.parent[i]]
+        if robot.moves[j]:
+            for k in range(robot.joints[j].dof):
+                parent.append(of_link[i])
+                link.append(i)
+                screw.append(k)
+                of_link[i] = len(parent) - 1
+    return Bodies(parent, link, screw, of_link)
+
+
+def _check_inertia(robot, bodies):
+    """Refuse a moving joint with neither inertia beyond it nor a rotor: its acceleration is not determined."""
+    heavy = [False] * (len(bodies.parent) + 1)
+    for link, b in zip(robot.links, bodies.of_link, strict=True):
+        heavy[b] |= link.is_heavy
+    for b in reversed(range(len(bodies.parent))):
+        i = bodies.link[b]
+        joint = robot.joints[robot.tree.joint[i]]
+        heavy[b] |= joint.rotor_inertia > 0
+        if not heavy[b]:
+            raise RobotError(
+                f"pack: link {robot.links[i].name!r} and what hangs from it have no mass, so joint {joint.name!r} has "
+                f"no defined acceleration; give the link mass, lock the joint, or give the joint a rotor_inertia."
+            )
+        heavy[bodies.parent[b]] |= heavy[b]
+    if not heavy[-1] and not robot.grounded:
+        raise RobotError(f"pack: the free robot has no mass at all; give link {robot.base!r} a mass, or ground it.")
+
+
+# ---- arrays ----------------------------------------------------------------------------------------------------------
 
 
 def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
@@ -174,24 +204,26 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     if robot.loops:
         names = [loop.name for loop in robot.loops]
         raise RobotError(f"pack: the robot has the loops {names}; closed chains are not supported yet, open() them.")
-    _check_fits(robot, capacity, _sizes(robot, capacity.width))
-    parent, what, body = _bodies(robot)
-    _check_inertia(robot, parent, what, body)
-    joint_at = {name: k for k, name in enumerate(capacity.joint_names)}
-    link_at = {name: k for k, name in enumerate(capacity.link_names)}
-    joint_index, dof_value, dof_to_q, quats = _coordinates(robot, capacity, joint_at, link_at)
-    steps = schedule(parent, capacity.width)
+    bodies = _bodies(robot)
+    steps = schedule(bodies.parent, capacity.width)
+    _check_fits(robot, capacity, _sizes(robot, len(steps)))
+    _check_inertia(robot, bodies)
 
-    W, slots = capacity.width, capacity.slots
-    slot = {b: t * W + w for t, step in enumerate(steps) for w, b in enumerate(step)} | {-1: slots}
-    slot_index, ancestors = _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_index, quats)
-    link_index = _link_index(robot, capacity, body, slot, joint_at, link_at)
+    # where the robot's links, joints and bodies are in the arrays; the last entry, also number -1, stands for none
+    links, joints = capacity.numbers["link"], capacity.numbers["joint"]
+    link_at = np.array([*(links[link.name] for link in robot.links), capacity.links])
+    joint_at = np.array([*(joints[joint.name] for joint in robot.joints), capacity.joints])
+    slot = np.full(len(bodies.parent) + 1, capacity.slots)
+    for t, step in enumerate(steps):
+        slot[step] = range(t * capacity.width, t * capacity.width + len(step))
+
+    joint_index, dof_value, dof_to_q, quat_index = _coordinates(robot, capacity, joint_at)
+    slot_index, ancestors = _slot_index(robot, capacity, bodies, slot, link_at, joint_at, joint_index)
+    link_index = _link_index(robot, capacity, slot[bodies.of_link], link_at, joint_at)
     joint_value = _joint_value(robot, capacity, joint_at)
     mass, com, inertia = _params(robot, capacity, link_at)
     slot_value, base, link_pose = derive(np, slot_index, link_index, joint_value, mass, com, inertia)
-    frame_index, frame_value = _frames(robot, capacity, link_at)
-    quat_index = np.full((3, capacity.quaternions), -1, np.int32)
-    quat_index[:, : len(quats)] = np.array([x[:3] for x in quats.values()], np.int32).reshape(-1, 3).T
+    frame_index, frame_value = _frames(robot, capacity)
     base_value = np.concatenate([base, [0.0 if robot.grounded else 1.0], _ground(robot)])
     chain = Chain(
         slot_index, slot_value, base_value, ancestors, link_index, mass, com, inertia, link_pose, joint_index,
@@ -200,132 +232,108 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, chain)
 
 
-def _check_inertia(robot, parent, what, body):
-    """Refuse a moving joint with neither inertia beyond it nor a rotor: its acceleration is not determined."""
-    heavy = [False] * (len(parent) + 1)
-    for i, link in enumerate(robot.links):
-        heavy[body[i]] |= link.mass > 0 or bool(link.inertia.any())
-    for b in reversed(range(len(parent))):
-        joint = robot.joints[robot.tree.joint[what[b][0]]]
-        heavy[b] |= joint.rotor_inertia > 0
-        if not heavy[b]:
-            link = robot.links[what[b][0]].name
-            raise RobotError(
-                f"pack: link {link!r} and what hangs from it have no mass, so joint {joint.name!r} has no defined "
-                f"acceleration; give the link mass, lock the joint, or give the joint a rotor_inertia."
-            )
-        heavy[parent[b]] |= heavy[b]
-    if not heavy[-1] and not robot.grounded:
-        raise RobotError(f"pack: the free robot has no mass at all; give link {robot.base!r} a mass, or ground it.")
-
-
-def _coordinates(robot, capacity, joint_at, link_at):
-    """joint_index, dof_value, dof_to_q, and {joint: (first of q, first of v, backwards)} of the quaternions."""
+def _coordinates(robot, capacity, joint_at):
+    """joint_index, dof_value, dof_to_q and quat_index."""
+    joints, at, links, row = robot.joints, joint_at[:-1], capacity.numbers["link"], JointRow
+    moves = np.array(robot.moves, int)
+    nq = moves * np.array([joint.nq for joint in joints], int)
+    dof = moves * np.array([joint.dof for joint in joints], int)
+    q, v = moves * (np.cumsum(nq) - nq), moves * (np.cumsum(dof) - dof)
     index = np.zeros((9, capacity.joints), np.int32)
-    index[JointRow.NAME] = [name_hash(name) for name in capacity.joint_names]
-    values, to_q, quats, q, v = np.zeros((3, capacity.nv)), np.full(capacity.nv, -1, np.int32), {}, 0, 0
-    for joint in robot.joints:
-        k = joint_at[joint.name]
-        index[[JointRow.PRESENT, JointRow.PARENT, JointRow.CHILD], k] = 1, link_at[joint.parent], link_at[joint.child]
-        if robot.is_locked(joint):
-            continue
-        values[:, v : v + joint.dof] = np.array([[joint.damping, joint.stiffness, joint.rotor_inertia]]).T
-        if joint.kind != "spherical":
-            to_q[v : v + joint.dof] = np.arange(q, q + joint.dof)
-        index[[JointRow.MOVES, JointRow.Q, JointRow.NQ, JointRow.V, JointRow.DOF], k] = 1, q, joint.nq, v, joint.dof
-        if joint.kind == "spherical":
-            i = robot.tree.joint.index(robot.joints.index(joint))
-            quats[joint.name] = (q, v, int(not robot.tree.forward[i]))
-        q, v = q + joint.nq, v + joint.dof
-    return index, values, to_q, quats
+    index[row.NAME] = capacity.hashes["joint"]
+    index[row.PRESENT, at], index[row.MOVES, at] = 1, moves
+    index[row.Q, at], index[row.NQ, at], index[row.V, at], index[row.DOF, at] = q, nq, v, dof
+    index[row.PARENT, at] = [links[joint.parent] for joint in joints]
+    index[row.CHILD, at] = [links[joint.child] for joint in joints]
+
+    value, to_q = np.zeros((3, capacity.nv)), np.full(capacity.nv, -1, np.int32)
+    of, n = np.repeat(np.arange(len(joints)), dof), dof.sum()  # the joint of each degree of freedom; their number
+    value[:, :n] = np.array([(x.damping, x.stiffness, x.rotor_inertia) for x in joints]).reshape(-1, 3)[of].T
+    to_q[:n] = np.where((nq > dof)[of], -1, (q - v)[of] + np.arange(n))
+
+    quat, spherical = np.full((3, capacity.quaternions), -1, np.int32), np.flatnonzero(nq > dof)
+    backwards = np.zeros(len(joint_at), bool)
+    backwards[list(robot.tree.joint)] = np.logical_not(robot.tree.forward)
+    quat[:, : len(spherical)] = q[spherical], v[spherical], backwards[spherical]
+    return index, value, to_q, quat
 
 
-def _slot_index(robot, capacity, parent, what, slot, joint_at, link_at, joint_index, quats):
+def _slot_index(robot, capacity, bodies, slot, link_at, joint_at, joint_index):
+    """slot_index and ancestors."""
+    tree, row = robot.tree, SlotRow
     index = np.zeros((10, capacity.slots), np.int32)
-    row, size = SlotRow, capacity
-    index[row.PARENT], index[row.JOINT], index[row.FROM] = size.slots + 1, size.joints, size.links
-    index[row.QUAT], index[row.SIGN], index[row.FORWARD] = size.quaternions, 1, 1
-    first_v, v = {}, 0
-    for joint in robot.moving:
-        first_v[joint.name] = v
-        v += joint.dof
-    ancestors = np.zeros((capacity.slots, capacity.slots), bool)
-    for b, (i, k) in enumerate(what):
-        joint, ahead = robot.joints[robot.tree.joint[i]], robot.tree.forward[i]
-        turned = joint.kind == "spherical"
-        screw = k if ahead or turned else joint.dof - 1 - k  # traversed backwards, the screws come in reverse
-        s = slot[b]
-        index[row.PARENT, s], index[row.DOF, s] = slot[parent[b]], first_v[joint.name] + screw
-        index[row.LIVE, s], index[row.FORWARD, s], index[row.FIRST, s] = 1, ahead, k == 0
-        index[row.JOINT, s], index[row.SCREW, s] = joint_at[joint.name], screw
-        index[row.SIGN, s] = 1 if ahead or turned else -1
-        index[row.QUAT, s] = list(quats).index(joint.name) if turned and k == 0 else size.quaternions
-        index[row.FROM, s] = link_at[robot.links[robot.tree.parent[i]].name]
-        if parent[b] >= 0:
-            ancestors[s] = ancestors[slot[parent[b]]]
-        ancestors[s, s] = True
-    return index.reshape(10, capacity.steps, capacity.width), ancestors
+    index[row.PARENT], index[row.JOINT], index[row.FROM] = capacity.slots + 1, capacity.joints, capacity.links
+    index[row.QUAT], index[row.SIGN], index[row.FORWARD] = capacity.quaternions, 1, 1
+
+    s, (parent, link, k) = slot[:-1], (np.array(x, int) for x in (bodies.parent, bodies.link, bodies.screw))
+    joint, ahead = joint_at[np.array(tree.joint)[link]], np.array(tree.forward)[link]
+    spherical = joint_index[JointRow.NQ] > joint_index[JointRow.DOF]
+    straight = ahead | spherical[joint]  # traversed backwards, screws come in reverse and turn the other way
+    screw = np.where(straight, k, joint_index[JointRow.DOF, joint] - 1 - k)
+    quat = np.where(spherical[joint] & (k == 0), np.cumsum(spherical)[joint] - 1, capacity.quaternions)
+    index[row.PARENT, s], index[row.FROM, s] = slot[parent], link_at[np.array(tree.parent)[link]]
+    index[row.DOF, s], index[row.QUAT, s] = joint_index[JointRow.V, joint] + screw, quat
+    index[row.JOINT, s], index[row.SCREW, s], index[row.SIGN, s] = joint, screw, np.where(straight, 1, -1)
+    index[row.LIVE, s], index[row.FORWARD, s], index[row.FIRST, s] = 1, ahead, k == 0
+
+    ancestors = np.zeros((capacity.slots + 1, capacity.slots), bool)  # the last row is the base's
+    ancestors[s, s] = True
+    for b, p in zip(s, slot[parent], strict=True):
+        ancestors[b] |= ancestors[p]
+    return index.reshape(10, capacity.steps, capacity.width), ancestors[:-1]
 
 
-def _link_index(robot, capacity, body, slot, joint_at, link_at):
-    index = np.zeros((6, capacity.links), np.int32)
-    index[LinkRow.NAME] = [name_hash(name) for name in capacity.link_names]
-    index[LinkRow.SLOT], index[LinkRow.PARENT] = capacity.slots + 1, capacity.links
-    index[LinkRow.JOINT] = capacity.joints
-    index[LinkRow.FORWARD] = 1
-    for i, link in enumerate(robot.links):
-        k, j = link_at[link.name], robot.tree.joint[i]
-        index[LinkRow.SLOT, k] = slot[body[i]]
-        if j < 0:
-            continue
-        joint = robot.joints[j]
-        index[LinkRow.JOINT, k], index[LinkRow.FORWARD, k] = joint_at[joint.name], robot.tree.forward[i]
-        index[LinkRow.PARENT, k] = link_at[robot.links[robot.tree.parent[i]].name]
-        index[LinkRow.FIXED, k] = robot.is_locked(joint)
+def _link_index(robot, capacity, slot, link_at, joint_at):
+    """link_index; `slot` is that of each link's body."""
+    row, (parent, joint) = LinkRow, (np.array(x) for x in (robot.tree.parent, robot.tree.joint))
+    locked = np.array([*(not x for x in robot.moves), False])
+    index, at = np.zeros((6, capacity.links), np.int32), link_at[:-1]
+    index[row.NAME], index[row.FORWARD] = capacity.hashes["link"], 1
+    index[row.SLOT], index[row.PARENT], index[row.JOINT] = capacity.slots + 1, capacity.links, capacity.joints
+    index[row.SLOT, at], index[row.PARENT, at], index[row.JOINT, at] = slot, link_at[parent], joint_at[joint]
+    index[row.FORWARD, at], index[row.FIXED, at] = robot.tree.forward, locked[joint]
     return index
 
 
 def _joint_value(robot, capacity, joint_at):
     values = np.zeros((capacity.joints, JointValue.SIZE))
     values[:, [0, 4, 8, JointValue.LOCK_QUAT]] = 1.0
-    for joint in robot.joints:
-        row = values[joint_at[joint.name]]
-        row[:9], row[9:12] = joint.rotation.ravel(), joint.position
-        row[JointValue.SCREWS : JointValue.SCREWS + 6 * joint.dof] = joint.screws.ravel()
-        if joint.name in robot.locked:
-            lock = JointValue.LOCK_QUAT if joint.kind == "spherical" else JointValue.LOCK
-            row[lock : lock + joint.nq] = robot.locked[joint.name]
+    if robot.joints:
+        values[joint_at[:-1], : JointValue.LOCK] = [joint.constants for joint in robot.joints]
+    for name, value in robot.locked.items():
+        first = JointValue.LOCK if len(value) < 4 else JointValue.LOCK_QUAT
+        values[capacity.numbers["joint"][name], first : first + len(value)] = value
     return values
 
 
 def _params(robot, capacity, link_at):
-    at = [link_at[link.name] for link in robot.links]
     mass, com, inertia = np.zeros(capacity.links), np.zeros((capacity.links, 3)), np.zeros((capacity.links, 3, 3))
-    mass[at] = [link.mass for link in robot.links]
-    com[at] = [link.com for link in robot.links]
-    inertia[at] = [link.inertia for link in robot.links]
+    mass[link_at[:-1]] = [link.mass for link in robot.links]
+    com[link_at[:-1]] = [link.com for link in robot.links]
+    inertia[link_at[:-1]] = [link.inertia for link in robot.links]
     return mass, com, inertia
 
 
-def _frames(robot, capacity, link_at):
+def _frames(robot, capacity):
     index, value = np.zeros((2, capacity.frames), np.int32), np.zeros((capacity.frames, 12))
-    index[0], value[:, [0, 4, 8]] = [name_hash(name) for name in capacity.frame_names], 1.0
+    index[0], value[:, [0, 4, 8]] = capacity.hashes["frame"], 1.0
     index[1] = -1
     for frame in robot.frames:
-        k = capacity.frame_names.index(frame.name)
-        index[1, k] = link_at[frame.link]
-        value[k] = np.concatenate([frame.rotation.ravel(), frame.position])
+        k = capacity.numbers["frame"][frame.name]
+        index[1, k] = capacity.numbers["link"][frame.link]
+        value[k, :9], value[k, 9:] = frame.rotation.ravel(), frame.position
     return index, value
 
 
 def _ground(robot):
     """Pose of a grounded base, [position, quaternion wxyz]."""
     R, p = robot.ground_pose
-    t = np.array([1 + np.trace(R), *(1 - np.trace(R) + 2 * np.diag(R))])
-    k = int(np.argmax(t))  # the largest of the four squares
-    a = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    rows = np.zeros((4, 4))
-    rows[0, 1:] = rows[1:, 0] = a
-    rows[1:, 1:] = R + R.T
-    rows[range(4), range(4)] = t
-    return np.concatenate([p, rows[k] / np.linalg.norm(rows[k])])
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    M = np.array([  # 4 quat quatᵀ
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, b + d, c + g],
+        [c - g, b + d, 1 - a + e - i, f + h],
+        [d - b, c + g, f + h, 1 - a - e + i],
+    ])  # fmt: skip
+    row = M[M.diagonal().argmax()]
+    return np.concatenate([p, row / np.linalg.norm(row)])

@@ -21,11 +21,11 @@ class Kind:
     rates: tuple[str, ...]
     """Suffixes of the names of its entries of v."""
 
-    @property
+    @cached_property
     def dof(self) -> int:
         return len(self.rates)
 
-    @property
+    @cached_property
     def nq(self) -> int:
         return len(self.coordinates)
 
@@ -91,6 +91,11 @@ class Link(Part):
                 f"positive, and no one larger than the sum of the others. Correct it, let `sdyn check` "
                 f"propose a repair, or pass allow_unphysical=True."
             )
+
+    @cached_property
+    def is_heavy(self) -> bool:
+        """Whether it resists any motion: it has a mass or an inertia."""
+        return self.mass > 0 or bool(self.inertia.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,12 +174,12 @@ class Joint(Part):
                 raise RobotError(f"the limits of {here} are {x.tolist()}; the lower one must come first.")
             put("limits", (tuple(map(float, x[0])) if dof == 1 else tuple(tuple(map(float, r)) for r in x)) or None)
 
-    @property
+    @cached_property
     def dof(self) -> int:
         """Degrees of freedom."""
         return KINDS[self.kind].dof
 
-    @property
+    @cached_property
     def nq(self) -> int:
         """Entries of q."""
         return KINDS[self.kind].nq
@@ -196,6 +201,11 @@ class Joint(Part):
             "spherical": [turn(e) for e in np.eye(3)],
         }[self.kind]
         return np.array(rows).reshape(-1, 6)
+
+    @cached_property
+    def constants(self) -> np.ndarray:
+        """Rotation, position and three screws [30]; screws that it has not are zero."""
+        return np.concatenate([self.rotation.ravel(), self.position, self.screws.ravel(), np.zeros(18 - 6 * self.dof)])
 
 
 def _spread(value, shape, what) -> np.ndarray:

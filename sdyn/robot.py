@@ -10,10 +10,11 @@
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 
-from sdyn.checks import RobotError, array, distinct, known, number, pose, unit
+from sdyn.checks import RobotError, array, distinct, known, number, pose, read_only, unit
 from sdyn.parts import KINDS, Frame, Joint, Link, Loop, Part, renamed
 from sdyn.posture import link_poses
 from sdyn.table import Table, table
@@ -71,7 +72,8 @@ class Robot(Part):
                 if end.link != GROUND:
                     known(end.link, names, f"link (of loop {loop.name!r}) named")
         put("ground_pose", pose(self.ground_pose, "the ground pose"))
-        put("locked", {name: self._lock_value(name, value) for name, value in self.locked.items()})
+        joints = {joint.name: joint for joint in self.joints}
+        put("locked", {name: _lock_value(joints.get(name) or self.joint(name), x) for name, x in self.locked.items()})
         self.tree  # noqa: B018  (refuses cycles and loose links now, not later)
 
     def __eq__(self, other):
@@ -97,10 +99,15 @@ class Robot(Part):
         """Whether a joint does not move: it is locked, or of kind fixed."""
         return joint.kind == "fixed" or joint.name in self.locked
 
-    @property
+    @cached_property
+    def moves(self) -> tuple[bool, ...]:
+        """Whether each joint moves, in declared order."""
+        return tuple(not self.is_locked(joint) for joint in self.joints)
+
+    @cached_property
     def moving(self) -> tuple[Joint, ...]:
         """The joints that move, in declared order."""
-        return tuple(joint for joint in self.joints if not self.is_locked(joint))
+        return tuple(compress(self.joints, self.moves))
 
     @property
     def nv(self) -> int:
@@ -143,7 +150,7 @@ class Robot(Part):
             out += [array(position, (3,), "the position"), unit(quaternion, "the quaternion", 4)]
         for joint in self.moving:
             rest = np.r_[1.0, 0.0, 0.0, 0.0] if joint.kind == "spherical" else np.zeros(joint.nq)
-            out.append(self._value(joint, joints.pop(joint.name, rest)))
+            out.append(_value(joint, joints.pop(joint.name, rest)))
         self._refuse_rest(joints)
         return np.concatenate([np.zeros(0), *out])
 
@@ -182,8 +189,6 @@ class Robot(Part):
         Args:
             joints: {name: value}, the value in the units of q.
         """
-        for name in joints:
-            self.joint(name)
         return replace(self, locked={**self.locked, **joints})
 
     def unlock(self, joints=None) -> "Robot":
@@ -375,24 +380,27 @@ class Robot(Part):
         known(x.link, [*(link.name for link in self.links), GROUND], "link")
         return x
 
-    def _lock_value(self, name, value):
-        joint = self.joint(name)
-        if joint.kind == "fixed":
-            raise RobotError(f"lock: joint {name!r} is of kind fixed and cannot move anyway; leave it out.")
-        return self._value(joint, value)
-
-    @staticmethod
-    def _value(joint, value) -> np.ndarray:
-        what = f"the value of joint {joint.name!r}"
-        if joint.kind == "spherical":
-            return unit(value, what, 4)
-        return array([number(value, what)] if joint.nq == 1 and np.ndim(value) == 0 else value, (joint.nq,), what)
-
     def _refuse_rest(self, joints):
         for name in joints:
             if name in self.locked:
                 raise RobotError(f"joint {name!r} is locked and has no coordinate; unlock it, or leave it out.")
             known(name, [joint.name for joint in self.moving], "moving joint")
+
+
+def _lock_value(joint, value) -> np.ndarray:
+    if joint.kind == "fixed":
+        raise RobotError(f"lock: joint {joint.name!r} is of kind fixed and cannot move anyway; leave it out.")
+    return _value(joint, value)
+
+
+def _value(joint, value) -> np.ndarray:
+    """Entries of q of one joint."""
+    what = f"the value of joint {joint.name!r}"
+    if joint.kind == "spherical":
+        return unit(value, what, 4)
+    if joint.nq == 1 and np.ndim(value) == 0:
+        return read_only(np.array([number(value, what)]))
+    return array(value, (joint.nq,), what)
 
 
 _pose = pose  # `ground` has an argument of the same name
