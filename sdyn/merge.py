@@ -99,8 +99,9 @@ def _bodies(xp, slot, slots, mass, com, inertia, R, p):
     """Mass, centre and inertia about it of the body in each slot, the base last; a dummy's links are left out."""
     member = (np.arange(slots + 1)[:, None] == slot[None]).astype(mass.dtype)
     x = p + _turn(R, com)
-    m = member @ mass
-    c = (member @ (mass[:, None] * x)) / xp.where(m > 0, m, 1.0)[:, None]
+    moments = member @ (mass[:, None] * xp.concatenate([xp.ones_like(x[:, :1]), x], 1))
+    m = moments[:, 0]
+    c = moments[:, 1:] / xp.where(m > 0, m, 1.0)[:, None]
     d = x - c[xp.minimum(slot, slots)]
     steiner = (d * d).sum(1)[:, None, None] * np.eye(3, dtype=mass.dtype) - d[:, :, None] * d[:, None]
     about_centre = R @ inertia @ xp.swapaxes(R, 1, 2) + mass[:, None, None] * steiner

@@ -215,7 +215,8 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     joint_at = np.array([*(joints[joint.name] for joint in robot.joints), capacity.joints])
     slot = np.full(len(bodies.parent) + 1, capacity.slots)
     for t, step in enumerate(steps):
-        slot[step] = range(t * capacity.width, t * capacity.width + len(step))
+        for w, body in enumerate(step):
+            slot[body] = t * capacity.width + w
 
     joint_index, dof_value, dof_to_q, quat_index = _coordinates(robot, capacity, joint_at)
     slot_index, ancestors = _slot_index(robot, capacity, bodies, slot, link_at, joint_at, joint_index)
@@ -225,11 +226,11 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     slot_value, base, link_pose = derive(np, slot_index, link_index, joint_value, mass, com, inertia)
     frame_index, frame_value = _frames(robot, capacity)
     base_value = np.concatenate([base, [0.0 if robot.grounded else 1.0], _ground(robot)])
-    chain = Chain(
+    packed = Chain(
         slot_index, slot_value, base_value, ancestors, link_index, mass, com, inertia, link_pose, joint_index,
         joint_value, dof_value, quat_index, dof_to_q, frame_index, frame_value, capacity,
     )  # fmt: skip
-    return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, chain)
+    return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, packed)
 
 
 def _coordinates(robot, capacity, joint_at):
@@ -299,7 +300,8 @@ def _joint_value(robot, capacity, joint_at):
     values = np.zeros((capacity.joints, JointValue.SIZE))
     values[:, [0, 4, 8, JointValue.LOCK_QUAT]] = 1.0
     if robot.joints:
-        values[joint_at[:-1], : JointValue.LOCK] = [joint.constants for joint in robot.joints]
+        constants = np.concatenate([joint.constants for joint in robot.joints])
+        values[joint_at[:-1], : JointValue.LOCK] = constants.reshape(-1, JointValue.LOCK)
     for name, value in robot.locked.items():
         first = JointValue.LOCK if len(value) < 4 else JointValue.LOCK_QUAT
         values[capacity.numbers["joint"][name], first : first + len(value)] = value
