@@ -40,6 +40,18 @@ class LinkRow:
     NAME, SLOT, PARENT, JOINT, FORWARD, FIXED = range(6)
 
 
+class LoopRow:
+    """Rows of `Chain.loop_index`. The link number behind the last one is the ground."""
+
+    NAME, PRESENT, A, B = range(4)
+
+
+class ClosureRow:
+    """Rows of `Chain.row_index`. `PART` as in `parts.CLOSURES`."""
+
+    LOOP, PART, LIVE = range(3)
+
+
 class JointRow:
     """Rows of `Chain.joint_index`."""
 
@@ -72,11 +84,15 @@ class Capacity:
     """Entries of v behind the base block."""
     quaternions: int
     """Moving spherical joints."""
+    loops: int
+    rows: int
+    """Rows of the closures: entries of lam."""
     layout: str
     """"free" or "grounded": exact arrays of one structure; "padded": a base block always, zeros at the end."""
     link_names: tuple[str, ...] = field(compare=False)
     joint_names: tuple[str, ...] = field(compare=False)
     frame_names: tuple[str, ...] = field(compare=False)
+    loop_names: tuple[str, ...] = field(compare=False)
 
     @property
     def slots(self) -> int:
@@ -85,12 +101,12 @@ class Capacity:
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, int]]:
-        """The number of each part by its name, for "link", "joint" and "frame"."""
+        """The number of each part by its name, for "link", "joint", "frame" and "loop"."""
         return {key: {name: k for k, name in enumerate(names)} for key, names in self._names().items()}
 
     @cached_property
     def hashes(self) -> dict[str, np.ndarray]:
-        """Hashes of the names, in order, for "link", "joint" and "frame".
+        """Hashes of the names, in order, for "link", "joint", "frame" and "loop".
 
         Raises:
             RobotError: If two parts of a sort have the same hash.
@@ -102,7 +118,7 @@ class Capacity:
         return out
 
     def _names(self):
-        return {"link": self.link_names, "joint": self.joint_names, "frame": self.frame_names}
+        return {key: getattr(self, key + "_names") for key in ("link", "joint", "frame", "loop")}
 
     @property
     def base_nq(self) -> int:
@@ -157,6 +173,12 @@ class Chain:
     """Per frame: hash of its name, link."""
     frame_value: Float[Array, "frames 12"]
     """Rotation and position of each frame in its link [-, m]."""
+    loop_index: Int[Array, "4 loops"]
+    """Per loop: hash of its name, present, links of the frames a and b."""
+    loop_value: Float[Array, "loops 24"]
+    """Rotation and position of frame a in its link (or in the world), and of frame b [-, m]."""
+    row_index: Int[Array, "3 rows"]
+    """Per row of the closures: its loop, which part of the relative twist it holds, live."""
     capacity: Capacity = field(metadata={"static": True})
 
     @property

@@ -16,7 +16,7 @@ from sdyn.kinematics import link_poses, poses
 from sdyn.rnea import rnea
 
 
-def forward_dynamics(
+def tree_dynamics(
     chain: Chain,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
@@ -25,21 +25,7 @@ def forward_dynamics(
     gravity: Float[Array, "3"] | None = None,
     f_ext: Float[Array, "n 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """Accelerations of a structure, by the articulated-body algorithm.
-
-    Args:
-        chain: Packed structure.
-        q: Configuration [m, rad, unit quaternion wxyz].
-        v: Velocity [rad/s, m/s]; the base part is the twist of the base's origin in base axes.
-        tau: Force, laid out as v [N m, N]; damping and stiffness of the joints are added inside.
-        gravity: Acceleration of free fall, world axes [m/s^2]; none by default.
-        f_ext: One wrench [n; f] per link, world axes, about the link's origin [N m, N]; none by default.
-
-    Returns:
-        vdot, the plain time derivative of the components of v [rad/s^2, m/s^2].
-
-    Raises:
-        ValueError: While tracing, if a shape or type differs; nothing at run time.
+    """`forward_dynamics` of the tree alone: what the closures hold is let go.
 
     Source:
         Featherstone (2008), section 7.3; derivatives by the implicit rule, see `aba.py`.

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sdyn.chain import Chain
+from sdyn.constraints import forward_dynamics
 from sdyn.coordinates import increment_rate, retract
-from sdyn.dynamics import forward_dynamics
 from sdyn.inputs import expect
 
 

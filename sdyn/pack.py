@@ -5,10 +5,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, SlotRow
+from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, LoopRow, SlotRow
 from sdyn.checks import RobotError
 from sdyn.merge import derive
-from sdyn.robot import Robot
+from sdyn.parts import CLOSURES
+from sdyn.robot import GROUND, Robot
 from sdyn.schedule import schedule
 
 
@@ -26,8 +27,7 @@ def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = 
         The chain. A structure of the same capacity is the same compile key.
 
     Raises:
-        RobotError: If a body without inertia hangs from a moving joint, a loop is open business, or the capacity is
-            too small.
+        RobotError: If a body without inertia hangs from a moving joint, or the capacity is too small.
     """
     capacity = _capacity_of([robot], width or 1, padded=False) if capacity is None else capacity
     return jax.device_put(_arrays(robot, capacity, _float_type(dtype)))
@@ -108,23 +108,25 @@ def _capacity_of(robots, width, padded) -> Capacity:
     if width < 1:
         raise RobotError(f"the width is {width}; a step holds at least one body.")
     union = lambda key: tuple(dict.fromkeys(part.name for robot in robots for part in getattr(robot, key)))
-    links, joints, frames = union("links"), union("joints"), union("frames")
+    links, joints, frames, loops = (union(key) for key in ("links", "joints", "frames", "loops"))
     sizes = [_sizes(robot, len(schedule(_bodies(robot).parent, width))) for robot in robots]
-    steps, nq, nv, quaternions = (max(column) for column in zip(*sizes, strict=True))
+    steps, nq, nv, quaternions, rows = (max(column) for column in zip(*sizes, strict=True))
     layout = "padded" if padded else "grounded" if robots[0].grounded else "free"
     return Capacity(
-        max(steps, 1), width, len(links), len(joints), len(frames), nq, nv, quaternions, layout, links, joints, frames
-    )
+        max(steps, 1), width, len(links), len(joints), len(frames), nq, nv, quaternions, len(loops), rows, layout,
+        links, joints, frames, loops,
+    )  # fmt: skip
 
 
 def _sizes(robot, steps):
-    """Steps, entries of q, of v, quaternions."""
+    """Steps, entries of q, of v, quaternions, rows of closures."""
     moving = robot.moving
     return (
         steps,
         sum(joint.nq for joint in moving),
         sum(joint.dof for joint in moving),
         sum(joint.kind == "spherical" for joint in moving),
+        sum(len(CLOSURES[loop.kind]) for loop in robot.loops),
     )
 
 
@@ -140,8 +142,9 @@ def _check_fits(robot, capacity, needs):
         raise RobotError("pack: the robot declares its joints in another order than the capacity; keep one order.")
     if capacity.layout != "padded" and (capacity.layout == "grounded") != robot.grounded:
         raise RobotError("pack: the capacity is the exact one of another robot; use sdyn.capacity([...]).")
-    have = capacity.steps, capacity.nq, capacity.nv, capacity.quaternions
-    for what, need, room in zip(("steps", "entries of q", "entries of v", "quaternions"), needs, have, strict=True):
+    have = capacity.steps, capacity.nq, capacity.nv, capacity.quaternions, capacity.rows
+    kinds = "steps", "entries of q", "entries of v", "quaternions", "rows of closures"
+    for what, need, room in zip(kinds, needs, have, strict=True):
         if need > room:
             raise RobotError(f"pack: the robot needs {need} {what} and the capacity has {room}; {again}.")
 
@@ -201,9 +204,6 @@ def _check_inertia(robot, bodies):
 
 def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     """The chain of a robot, in NumPy."""
-    if robot.loops:
-        names = [loop.name for loop in robot.loops]
-        raise RobotError(f"pack: the robot has the loops {names}; closed chains are not supported yet, open() them.")
     bodies = _bodies(robot)
     steps = schedule(bodies.parent, capacity.width)
     _check_fits(robot, capacity, _sizes(robot, len(steps)))
@@ -225,10 +225,11 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     mass, com, inertia = _params(robot, capacity, link_at)
     slot_value, base, link_pose = derive(np, slot_index, link_index, joint_value, mass, com, inertia)
     frame_index, frame_value = _frames(robot, capacity)
+    loops = _loops(robot, capacity)
     base_value = np.concatenate([base, [0.0 if robot.grounded else 1.0], _ground(robot)])
     packed = Chain(
         slot_index, slot_value, base_value, ancestors, link_index, mass, com, inertia, link_pose, joint_index,
-        joint_value, dof_value, quat_index, dof_to_q, frame_index, frame_value, capacity,
+        joint_value, dof_value, quat_index, dof_to_q, frame_index, frame_value, *loops, capacity,
     )  # fmt: skip
     return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, packed)
 
@@ -325,6 +326,24 @@ def _frames(robot, capacity):
         index[1, k] = capacity.numbers["link"][frame.link]
         value[k, :9], value[k, 9:] = frame.rotation.ravel(), frame.position
     return index, value
+
+
+def _loops(robot, capacity):
+    """loop_index, loop_value, row_index; an absent loop joins the ground to itself, and has no live row."""
+    index, value = np.zeros((4, capacity.loops), np.int32), np.zeros((capacity.loops, 24))
+    index[LoopRow.NAME] = capacity.hashes["loop"]
+    index[[LoopRow.A, LoopRow.B]] = capacity.links
+    value[:, [0, 4, 8, 12, 16, 20]] = 1.0
+    links, numbers = capacity.numbers["link"] | {GROUND: capacity.links}, capacity.numbers["loop"]
+    rows = []
+    for loop in sorted(robot.loops, key=lambda loop: numbers[loop.name]):
+        k, (a, b) = numbers[loop.name], (loop.frame_a, loop.frame_b)
+        index[1:, k] = 1, links[a.link], links[b.link]
+        value[k] = np.concatenate([a.rotation.ravel(), a.position, b.rotation.ravel(), b.position])
+        rows += [(k, part, 1) for part in CLOSURES[loop.kind]]
+    row_index = np.zeros((3, capacity.rows), np.int32)
+    row_index[:, : len(rows)] = np.array(rows, np.int32).reshape(-1, 3).T
+    return index, value, row_index
 
 
 def _ground(robot):

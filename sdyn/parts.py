@@ -40,7 +40,16 @@ KINDS = {
     "planar": Kind((".x", ".y", ".angle"), (".x", ".y", ".angle")),
     "spherical": Kind((".qw", ".qx", ".qy", ".qz"), (".wx", ".wy", ".wz")),
 }
-CLOSURES = ("weld", "point", "revolute", "prismatic", "universal", "spherical", "cylindrical", "planar")
+CLOSURES = {  # what each kind holds of the twist in frame a: angular x y z, linear x y z, and 6, see closures.py
+    "weld": (0, 1, 2, 3, 4, 5),
+    "point": (3, 4, 5),
+    "revolute": (0, 1, 3, 4, 5),
+    "prismatic": (0, 1, 2, 3, 4),
+    "universal": (6, 3, 4, 5),
+    "spherical": (3, 4, 5),
+    "cylindrical": (0, 1, 3, 4),
+    "planar": (0, 1, 5),
+}
 
 
 class Part:
@@ -249,7 +258,8 @@ class Loop(Part):
     Args:
         name: Unique among the loops.
         frame_a, frame_b: Frame records; on link "ground" the pose is in the world.
-        kind: weld, point, revolute, prismatic, universal, spherical, cylindrical or planar.
+        kind: weld, point, revolute, prismatic, universal, spherical, cylindrical or planar. The axis (planar: the
+            normal) is frame a's z; the second axis of a universal joint is frame b's x.
     """
 
     name: str

@@ -26,7 +26,7 @@ DEVICE = [
     ["pack", "sweep", "inputs", "coordinates"],
     ["rnea", "crba", "aba"],
     ["kinematics"],
-    ["dynamics"],
+    ["dynamics", "closures", "delassus", "constraints"],
     ["momentum", "params"],
     ["transition", "integrate"],
     ["rollout"],
