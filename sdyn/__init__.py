@@ -19,6 +19,7 @@ from sdyn.kinematics import body_poses, frame_acceleration, frame_jacobian, fram
 from sdyn.dynamics import bias_force, inverse_dynamics, mass_matrix, solve_mass
 from sdyn.closures import loop_jacobian, loop_residual, loop_wrenches
 from sdyn.constraints import Status, constrained_dynamics, forward_dynamics
+from sdyn.drift import project
 from sdyn.momentum import centre_of_mass, generalised_jacobian, kinetic_energy, momentum
 from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer

@@ -1,6 +1,6 @@
 """Dynamics of closed chains: M v̇ + b = τ + Kᵀ lam, with K v̇ = k.
 
-The multipliers come from the Delassus matrix G = K M⁻¹ Kᵀ, see `delassus.py`. Nothing is differentiated by AD: where
+The multipliers come from the Delassus matrix, see `delassus.py`. Nothing is differentiated by AD: where
 r = [ID(q, v, v̇) − Kᵀ lam − τ; K v̇ − k] is zero,
     [M −Kᵀ; K 0] [dv̇; dlam] = −dr  along every change of state, parameters or closures,
 with dr from inverse dynamics under the closures' wrenches and from one sweep of accelerations. It holds for redundant
@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sdyn.chain import Chain
-from sdyn.closures import closure_acceleration, closure_parts, loop_residual, loop_wrenches
-from sdyn.delassus import multipliers, rank, scaled
-from sdyn.dynamics import inverse_dynamics, solve_mass, tree_dynamics
+from sdyn.chain import Chain, ClosureRow
+from sdyn.closures import closure_acceleration, loop_residual, loop_wrenches
+from sdyn.delassus import delassus, solve
+from sdyn.dynamics import inverse_dynamics, tree_dynamics
 from sdyn.inputs import expect
+from sdyn.semidefinite import spectrum
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +53,7 @@ def forward_dynamics(
     *,
     gravity: Float[Array, "3"] | None = None,
     f_ext: Float[Array, "n 6"] | None = None,
+    baumgarte=None,
 ) -> Float[Array, " nv"]:
     """Accelerations of a structure, by the articulated-body algorithm; the loops that it has stay closed.
 
@@ -62,6 +64,7 @@ def forward_dynamics(
         tau: Force, laid out as v [N m, N]; damping and stiffness of the joints are added inside.
         gravity: Acceleration of free fall, world axes [m/s^2]; none by default.
         f_ext: One wrench [n; f] per link, world axes, about the link's origin [N m, N]; none by default.
+        baumgarte: Rate a [1/s] at which open loops close: K vdot = k - 2 a K v - a^2 residual; none by default.
 
     Returns:
         vdot, the plain time derivative of the components of v [rad/s^2, m/s^2].
@@ -75,7 +78,7 @@ def forward_dynamics(
     if chain.capacity.rows == 0:
         return tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    return _held(chain, q, v, tau, gravity, f_ext)[0]
+    return _held(chain, q, v, tau, gravity, f_ext, baumgarte)[0]
 
 
 def constrained_dynamics(
@@ -86,12 +89,13 @@ def constrained_dynamics(
     *,
     gravity: Float[Array, "3"] | None = None,
     f_ext: Float[Array, "n 6"] | None = None,
+    baumgarte=None,
     method: str = "proximal",
 ) -> tuple[Float[Array, " nv"], Float[Array, " nc"], Status]:
     """Accelerations of a closed chain, and the wrenches in its closures.
 
     Args:
-        chain, q, v, tau, gravity, f_ext: As for `forward_dynamics`; a consistent state comes from `project`.
+        chain, q, v, tau, gravity, f_ext, baumgarte: As for `forward_dynamics`; a consistent state comes from `project`.
         method: "proximal", on the Delassus matrix.
 
     Returns:
@@ -106,17 +110,17 @@ def constrained_dynamics(
     if method != "proximal":
         raise ValueError(f"constrained_dynamics: there is no method {method!r}; the method is 'proximal'.")
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    vdot, lam = _held(chain, q, v, tau, gravity, f_ext)
+    vdot, lam = _held(chain, q, v, tau, gravity, f_ext, baumgarte)
     return vdot, lam, _status(*jax.lax.stop_gradient((chain, q, v, vdot)))
 
 
 @partial(jax.custom_jvp)
-def _held(chain, q, v, tau, gravity, f_ext):
+def _held(chain, q, v, tau, gravity, f_ext, baumgarte):
     """vdot and lam."""
     free = tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
-    _, Y, G, judged = _delassus(chain, q)
-    lam = multipliers(G, *judged, -closure_acceleration(chain, q, v, free))
-    return free + Y @ lam, lam
+    system = delassus(chain, q)
+    lam = system.multipliers(-_opening(chain, q, v, free, baumgarte))
+    return free + system.Y @ lam, lam
 
 
 @partial(_held.defjvp, symbolic_zeros=True)
@@ -124,14 +128,21 @@ def _held_tangent(primals, tangents):
     chain, q = primals[:2]
     vdot, lam = _held(*primals)
     c, d = _slope(lambda *x: _residual(*x, vdot, lam), primals, tangents)
-    return (vdot, lam), _solve(chain, q, -c, -d)
+    return (vdot, lam), solve(chain, q, -c, -d)
 
 
-def _residual(chain, q, v, tau, gravity, f_ext, vdot, lam):
+def _opening(chain, q, v, vdot, rate):
+    """K v̇ − k, and what Baumgarte adds."""
+    if rate is None:
+        return closure_acceleration(chain, q, v, vdot)
+    return closure_acceleration(chain, q, v, vdot + 2 * rate * v) + rate**2 * loop_residual(chain, q)
+
+
+def _residual(chain, q, v, tau, gravity, f_ext, baumgarte, vdot, lam):
     F = loop_wrenches(chain, q, lam)
     F = F if f_ext is None else F + f_ext
     force = inverse_dynamics(chain, q, v, vdot, gravity=gravity, f_ext=F)
-    return force - tau, closure_acceleration(chain, q, v, vdot)
+    return force - tau, _opening(chain, q, v, vdot, baumgarte)
 
 
 def _slope(function, primals, tangents):
@@ -149,50 +160,14 @@ def _slope(function, primals, tangents):
     return jax.jvp(f, tuple(leaves[i] for i in at), tuple(along[i] for i in at))[1]
 
 
-def _solve(chain, q, c, d):
-    """x, y of M x − Kᵀ y = c, K x = d."""
-    K, Y, G, judged = _delassus(chain, q)
-    x = solve_mass(chain, q, c)
-    y = multipliers(G, *judged, d - K @ x)
-    return x + Y @ y, y
-
-
-def _delassus(chain, q):
-    """K, M⁻¹ Kᵀ, G = K M⁻¹ Kᵀ, and which rows are dead and when a pivot is zero."""
-    Ja, Jb, open_by = closure_parts(chain, q)
-    K = Ja - Jb
-    Y = jax.vmap(lambda row: solve_mass(chain, q, row), out_axes=1)(K)
-    return K, Y, K @ Y, _judged(*jax.lax.stop_gradient((K, Ja, Jb, open_by)))
-
-
-def _judged(K, Ja, Jb, open_by):
-    """Which rows of K are zero but for rounding, and the squared sine below which a row depends on others.
-
-    A row is the difference of two, of length `size`, and it is off by their rounding, and by as much as the closures
-    are open: where they should be redundant, that makes them look independent.
-    """
-    n, eps = len(K), jnp.finfo(K.dtype).eps
-    size = jnp.sqrt((Ja * Ja + Jb * Jb).sum(1))
-    length = jnp.sqrt((K * K).sum(1))
-    share = jnp.where(size > 0, length / jnp.where(size > 0, size, 1.0), 0.0)
-    drift = jnp.max(jnp.where(size > 0, jnp.abs(open_by) / jnp.where(size > 0, size, 1.0), 0.0))
-    off = jnp.maximum(64 * eps, jnp.minimum(10 * drift, 3e-5))
-    dead = share <= off
-    tolerance = jnp.maximum(64 * n * eps, (off / jnp.where(dead, 1.0, share)) ** 2)
-    return dead.astype(K.dtype), tolerance
-
-
 def _status(chain, q, v, vdot) -> Status:
-    K, _, G, judged = _delassus(chain, q)
-    independent = rank(*(x[..., None] for x in (G, *judged)))[0][:, 0]
-    count = independent.sum().astype(int)
-    A, d = scaled(G[..., None], judged[0][:, None])
-    A = A[..., 0] * (d[:, 0] > 0)  # dead rows have no singular value
-    sigma = jnp.sqrt(jnp.maximum(jnp.linalg.eigvalsh(A)[::-1], 0))
+    system = delassus(chain, q)
+    count, eigenvalues = spectrum(system.G, system.dead, system.tolerance)
+    sigma = jnp.sqrt(jnp.maximum(eigenvalues[::-1], 0))
     least = jnp.where(count > 0, sigma[jnp.maximum(count - 1, 0)], 1.0)
     drift = jnp.abs(loop_residual(chain, q)).max(initial=0.0)
-    noise = jnp.maximum(drift, 64 * jnp.finfo(K.dtype).eps)
-    live = jnp.sum(chain.row_index[2])
+    noise = jnp.maximum(drift, 64 * jnp.finfo(q.dtype).eps)
+    live = jnp.sum(chain.row_index[ClosureRow.LIVE])
     return Status(
         rank=count,
         redundant=count < live,

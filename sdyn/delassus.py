@@ -1,124 +1,62 @@
-"""The multipliers: the shortest lam of G lam = b, for the Delassus matrix G = K M⁻¹ Kᵀ, which may be singular.
+"""The Delassus matrix G = K M⁻¹ Kᵀ of a closed chain: how much the closures give way to the multipliers."""
 
-G is scaled to a unit diagonal and swept (Gauss-Jordan) in the order of its largest pivots. A row whose pivot is within
-rounding, or within what the closures are open, depends on the rows before it: it is left out, never regularised. With P
-the swept rows, D the others and X = G_PP⁻¹ G_PD, the vectors [−X; 1] span the null space, the shortest solution is
-    lam = Q [G_PP⁻¹ b_P; 0],  Q = 1 − N (Nᵀ N)⁻¹ Nᵀ,  N = [−X; 1],
-and S = Q G_PP⁻¹ Qᵀ is G⁺. The solution is what proximal iterations on G + μ tend to as μ goes to zero; as they do, it
-is improved by lam += S (b − G lam).
-
-Source: Carpentier, Budhiraja, Mansard, Proximal and sparse resolution of constrained dynamic equations (2021); the
-sweep operator: Goodnight (1979).
-"""
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jaxtyping import Array, Float
 
-from sdyn.batching import Kernel
-
-STEPS = 2  # of lam += S (b − G lam), the first from zero; a third changes nothing on any mechanism of the tests
-
-
-def scaled(G, dead):
-    """G with a unit diagonal, and the scale of its rows; dead rows become those of the identity."""
-    n = G.shape[0]
-    diagonal = jnp.stack([G[i, i] for i in range(n)])
-    live = (dead == 0) & (diagonal > 0)
-    d = jnp.where(live, 1 / jnp.sqrt(jnp.where(live, diagonal, 1.0)), 0.0)
-    return G * d[:, None] * d[None] + jnp.eye(n, dtype=G.dtype)[..., None] * (1 - live), d
+from sdyn.chain import Chain
+from sdyn.closures import closure_parts
+from sdyn.dynamics import solve_mass
+from sdyn.semidefinite import shortest
 
 
-def swept(A, tolerance):
-    """A after sweeping its rows, the largest pivot first, and which rows were swept [n, B].
+class Delassus(NamedTuple):
+    """What the closures and the mass matrix make of each other at a configuration."""
 
-    On the swept rows P and the others D, it holds [[−A_PP⁻¹, A_PP⁻¹ A_PD], [its transpose, 0]].
+    K: Float[Array, "nc nv"]
+    Y: Float[Array, "nv nc"]
+    """M⁻¹ Kᵀ."""
+    G: Float[Array, "nc nc"]
+    dead: Float[Array, " nc"]
+    """1 where a row of K is zero but for rounding."""
+    tolerance: Float[Array, " nc"]
+    """Pivot below which a row depends on others."""
+
+    def multipliers(self, b, dead=0.0):
+        """lam of G lam = b, the shortest; rows that are `dead` are left out."""
+        return shortest(self.G, jnp.maximum(self.dead, dead), self.tolerance, b)
+
+
+def delassus(chain: Chain, q) -> Delassus:
+    """The Delassus matrix, and what is needed beside it."""
+    Ja, Jb, residual = closure_parts(chain, q)
+    K = Ja - Jb
+    Y = jax.vmap(lambda row: solve_mass(chain, q, row), out_axes=1)(K)
+    return Delassus(K, Y, K @ Y, *_judged(*jax.lax.stop_gradient((K, Ja, Jb, residual))))
+
+
+def solve(chain: Chain, q, c, d):
+    """x, y of M x − Kᵀ y = c, K x = d."""
+    system = delassus(chain, q)
+    x = solve_mass(chain, q, c)
+    y = system.multipliers(d - system.K @ x)
+    return x + system.Y @ y, y
+
+
+def _judged(K, Ja, Jb, residual):
+    """Which rows of K are zero but for rounding, and the squared sine below which a row depends on others.
+
+    A row is the difference of two, together of length `size`. It is off by their rounding, and by as much as the
+    closures are open: where rows are redundant on the closed chain, that makes them look independent.
     """
-    n = A.shape[0]
-    numbers = jnp.arange(n)[:, None]
-
-    def step(_, carry):
-        A, left, done = carry
-        diagonal = jnp.where(left, jnp.stack([A[i, i] for i in range(n)]), -1.0)
-        e = numbers == jnp.argmax(diagonal, 0)
-        pivot = jnp.where(e, diagonal, 0).sum(0)
-        take = e & (pivot > tolerance)
-        x = jnp.where(e[None], A, 0).sum(1) - e
-        pivot = jnp.where(take.any(0), pivot, 1.0)
-        change = x[:, None] * x[None] / pivot + 2 * (e[:, None] & e[None])
-        return A - jnp.where(take.any(0), change, 0), left & ~e, done | take
-
-    start = A, jnp.ones(A.shape[1:], bool), jnp.zeros(A.shape[1:], bool)
-    A, _, done = lax.fori_loop(0, n, step, start)
-    return A, done
-
-
-def inverse(A, weight, tolerance):
-    """S, which solves A x = b with the least sum of weight x², and the independent rows [n, B]."""
-    n = A.shape[0]
-    eye = jnp.eye(n, dtype=A.dtype)[..., None]
-    A, rows = swept(A, tolerance)
-    both = rows[:, None] & rows[None]
-    own = jnp.where(both, -A, 0)
-
-    def shortest(_):
-        N = jnp.where(~rows[None], eye - jnp.where(rows[:, None], A, 0), 0)
-        square = _product(jnp.swapaxes(N, 0, 1), weight[:, None] * N)
-        inner, _ = swept(jnp.where(~rows[:, None] & ~rows[None], square, eye), jnp.zeros_like(tolerance))
-        Q = eye - _product(_product(N, -inner), jnp.swapaxes(N, 0, 1) * weight[None])
-        return _product(_product(Q, own), jnp.swapaxes(Q, 0, 1))
-
-    return lax.cond(rows.all(), lambda _: own, shortest, None), rows
-
-
-def _solve(G, dead, tolerance, b):
-    """lam [n, m, B] for the columns of b [n, m, B]."""
-    A, d = scaled(G, dead)
-    S, _ = inverse(A, d * d, tolerance)
-    b = b * d[:, None]
-    x = _product(S, b)
-    for _ in range(STEPS - 1):
-        x = x + _product(S, b - _product(A, x))
-    return (d[:, None] * x,)
-
-
-def _rank(G, dead, tolerance):
-    A, d = scaled(G, dead)
-    return ((swept(A, tolerance)[1] & (d > 0)).astype(G.dtype),)
-
-
-def _product(A, B):
-    """A B of matrices (n, n, B)."""
-    return (A[:, :, None] * B[None]).sum(1)
-
-
-# ---- derivatives -----------------------------------------------------------------------------------------------------
-
-
-def _tangent(operands, tangents, out):
-    """dlam = S (db − dG lam) + (1 − S G) dG S lam: the last term turns lam with the null space."""
-    G, dead, tolerance, _ = operands
-    dG, _, _, db = tangents
-    (lam,) = out
-    again = lambda b: solve(G, dead, tolerance, b)[0]
-    if dG is None:
-        return (again(db),)
-    dlam = again((0 if db is None else db) - _product(dG, lam))
-    turn = _product(dG, again(lam))
-    return (dlam + turn - again(_product(G, turn)),)
-
-
-def _transpose(operands, cotangents):
-    return solve(*operands[:3], cotangents[0])
-
-
-solve = Kernel(_solve, rule=_tangent, linear=(3,), transpose=_transpose)
-rank = Kernel(_rank, rule=lambda operands, tangents, out: (jnp.zeros_like(out[0]),))
-
-
-def multipliers(G, dead, tolerance, b):
-    """lam [n] or [n, m] of G lam = b, shortest, for one sample."""
-    columns = b if b.ndim == 2 else b[:, None]
-    stop = jax.lax.stop_gradient
-    (x,) = solve(G[..., None], stop(dead)[:, None], stop(tolerance)[:, None], columns[..., None])
-    return x[..., 0].reshape(b.shape)
+    n, eps = len(K), jnp.finfo(K.dtype).eps
+    size = jnp.sqrt((Ja * Ja + Jb * Jb).sum(1))
+    safe = jnp.where(size > 0, size, 1.0)
+    share = jnp.where(size > 0, jnp.sqrt((K * K).sum(1)) / safe, 0.0)
+    drift = jnp.max(jnp.where(size > 0, jnp.abs(residual) / safe, 0.0), initial=0.0)
+    off = jnp.maximum(64 * eps, jnp.minimum(10 * drift, 3e-5))
+    dead = share <= off
+    tolerance = jnp.maximum(64 * n * eps, (off / jnp.where(dead, 1.0, share)) ** 2)
+    return dead.astype(K.dtype), tolerance

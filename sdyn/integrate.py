@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sdyn.chain import Chain
 from sdyn.constraints import forward_dynamics
 from sdyn.coordinates import increment_rate, retract
+from sdyn.drift import corrected
 from sdyn.inputs import expect
 
 
@@ -23,6 +24,7 @@ def integrate(
     dt,
     *,
     method: str = "rk4",
+    drift="project",
     gravity: Float[Array, "3"] | None = None,
     f_ext: Float[Array, "n 6"] | None = None,
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
@@ -34,6 +36,8 @@ def integrate(
         tau: Force, laid out as v [N m, N].
         dt: Step [s]; may be traced, zero or negative.
         method: "rk4" (order 4) or "semi_implicit" (order 1, one evaluation).
+        drift: How loops stay closed: "project" moves the state back after the step, in the mass metric; a number is a
+            Baumgarte rate [1/s] (cheaper, but the error only decays; rate times dt at most 1), 0 does nothing.
         gravity: Acceleration of free fall, world axes [m/s^2].
         f_ext: Wrenches on the links, as for `forward_dynamics`.
 
@@ -44,19 +48,25 @@ def integrate(
         ValueError: If the method is unknown, or a shape or type differs.
     """
     q, v, tau = expect(chain, q=q, v=v, tau=tau)
-    return step(chain, q, v, lambda t, q, v: tau, 0.0, dt, method=method, gravity=gravity, f_ext=f_ext)
+    return step(chain, q, v, lambda t, q, v: tau, 0.0, dt, method=method, drift=drift, gravity=gravity, f_ext=f_ext)
 
 
-def step(chain, q, v, force, t, dt, *, method, gravity=None, f_ext=None):
+def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_ext=None):
     """`integrate`, with the force as a function of time and state that every stage evaluates."""
     dt = jnp.asarray(dt, chain.dtype)
-    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), gravity=gravity, f_ext=f_ext)
+    project = isinstance(drift, str)
+    if project and drift != "project":
+        raise ValueError(f"integrate: drift is {drift!r}; it must be 'project' or a Baumgarte rate [1/s].")
+    options = dict(gravity=gravity, f_ext=f_ext) | ({} if project else dict(baumgarte=drift))
+    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), **options)
     if method == "rk4":
-        return _rk4(chain, q, v, acceleration, t, dt)
-    if method == "semi_implicit":
+        q, v = _rk4(chain, q, v, acceleration, t, dt)
+    elif method == "semi_implicit":
         v = v + dt * acceleration(t, q, v)
-        return retract(chain, q, dt * increment_rate(chain, q, jnp.zeros_like(v), v)), v
-    raise ValueError(f"integrate: there is no method {method!r}; the methods are 'rk4' and 'semi_implicit'.")
+        q = retract(chain, q, dt * increment_rate(chain, q, jnp.zeros_like(v), v))
+    else:
+        raise ValueError(f"integrate: there is no method {method!r}; the methods are 'rk4' and 'semi_implicit'.")
+    return corrected(chain, q, v) if project and chain.capacity.rows else (q, v)
 
 
 def _rk4(chain, q0, v0, acceleration, t0, dt):

@@ -5,7 +5,8 @@ the placement of new joints from the state. Velocities jump as in a plastic impa
 nearest in kinetic energy,
     M (v+ − v0) = Σ J_iᵀ I_i (V_i − J_i v0),
 with I_i, V_i the inertia and twist of each original link before, and v0 the base's twist and the joint rates before.
-Where the V_i are possible after the change (unlock, release, re-root) nothing jumps. Total momentum is kept where
+Closures then stop what they hold of it: v ← v − (1 + e) M⁻¹ Kᵀ S K v, with the restitution e of the loops that are new.
+Where the V_i are possible after the change (unlock, release, open, re-root) nothing jumps. Total momentum is kept where
 nothing is grounded, and kinetic energy never grows.
 """
 
@@ -15,8 +16,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import BaseRow, Chain, JointRow, JointValue, LinkRow
+from sdyn.chain import BaseRow, Chain, ClosureRow, JointRow, JointValue, LinkRow, LoopRow
+from sdyn.closures import at_links, ends_of, wrenches
 from sdyn.coordinates import pose_of
+from sdyn.delassus import delassus
 from sdyn.dynamics import solve_mass
 from sdyn.inputs import expect
 from sdyn.kinematics import jacobian_columns, link_motions, poses
@@ -26,20 +29,23 @@ from sdyn.params import rederived
 from sdyn.rotation import from_matrix, normalised, product
 
 
-def transfer(before, after, q, v):
+def transfer(before, after, q, v, *, restitution=0.0):
     """The state of one variant, as the state of another variant of the same physical system.
 
     Args:
         before: Chain, or a tuple of chains that `after` attaches.
         after: Chain, or a tuple of chains that come from a detach.
         q, v: State of `before`; tuples if it is one.
+        restitution: How fast the frames of a new loop part, as a fraction of how fast they met, 0 to 1; a locked joint
+            and a grounded base stop.
 
     Returns:
-        after: With lock values, ground pose and the placement of newly attached joints taken from the state; a new
-            joint that moves starts at zero.
+        after: With lock values, ground pose, the placement of newly attached joints and the relative pose of new loops
+            taken from the state; a new joint that moves starts at zero, and so does a loop that has a joint's kind.
         q, v: State of `after`; tuples if it is one.
-        impulse: One impulsive wrench [n; f] per link of `after` [n, 6], the one that reaches it through the joint to
-            its parent in the tree (the base: through the ground), world axes, about the link's origin [N m s, N s].
+        impulse: One impulsive wrench [n; f] per link of `after`, the one that reaches it through the joint to its
+            parent in the tree (the base: through the ground), world axes, about the link's origin [N m s, N s]; then
+            one per loop, on frame a and about its origin: [n + loops, 6].
 
     Differentiable in everything, forward and reverse.
 
@@ -50,8 +56,8 @@ def transfer(before, after, q, v):
         before, q, v = (before,), (q,), (v,)
     world = _World(*map(jnp.concatenate, zip(*map(_world, before, q, v), strict=True)))
     if not isinstance(after, tuple):
-        return _arrive(world, after)
-    return tuple(zip(*(_arrive(world, chain) for chain in after), strict=True))
+        return _arrive(world, after, restitution)
+    return tuple(zip(*(_arrive(world, chain, restitution) for chain in after), strict=True))
 
 
 class _World(NamedTuple):
@@ -72,6 +78,10 @@ class _World(NamedTuple):
     value: Float[Array, "joints 7"]
     """Coordinates as in the lock values of `Chain.joint_value`."""
     rate: Float[Array, "joints 3"]
+    loop: Float[Array, " loops"]
+    """Hashes of the names, -1 where absent; the last one is nobody's."""
+    frames: Float[Array, "loops 24"]
+    """Their frames, as in `Chain.loop_value`."""
 
 
 def _world(chain: Chain, q, v) -> _World:
@@ -97,6 +107,8 @@ def _world(chain: Chain, q, v) -> _World:
         jnp.concatenate([jnp.where(joint[JointRow.PRESENT] == 1, joint[JointRow.NAME], -1), none]),
         pad(_values(chain, q[nb:]), 7),
         pad(_gather(v[nv:], joint[JointRow.V], joint[JointRow.DOF], 3), 3),
+        jnp.append(jnp.where(chain.loop_index[LoopRow.PRESENT] == 1, chain.loop_index[LoopRow.NAME], -1), -1),
+        pad(chain.loop_value, 24),
     )
 
 
@@ -117,7 +129,7 @@ def _values(chain, q):
     return jnp.where(joint[JointRow.MOVES][:, None] == 1, moving, chain.joint_value[:, JointValue.LOCK:])
 
 
-def _arrive(world: _World, chain: Chain):
+def _arrive(world: _World, chain: Chain, restitution):
     """The part of the world that is `chain`: (chain, q, v, impulse)."""
     link = _match(chain.link_index[LinkRow.NAME], world.link)
     joint = _match(chain.joint_index[JointRow.NAME], world.joint)
@@ -125,6 +137,9 @@ def _arrive(world: _World, chain: Chain):
     R, p, V = (x[link] for x in (world.R, world.p, world.V))
     R, p, V = _new_links(world, chain, R, p, V)
     chain = _carry(chain, world.value[joint], known, R, p)
+    held = jnp.any(chain.loop_index[LoopRow.NAME][:, None] == world.loop, 1)
+    frames = world.frames[_match(chain.loop_index[LoopRow.NAME], world.loop)]
+    chain = replace(chain, loop_value=jnp.where(held[:, None], frames, _closed(chain, R, p)))
 
     slot, parent = chain.link_index[LinkRow.SLOT], chain.link_index[LinkRow.PARENT]
     base = jnp.argmax((slot == chain.capacity.slots) & (parent == len(R)))
@@ -133,7 +148,7 @@ def _arrive(world: _World, chain: Chain):
     chain = replace(chain, base_value=base_value)
 
     q, v = _state(chain, base_value[BaseRow.POSE:], R[base], V[base], world.rate[joint] * known[:, None])
-    v, impulse = _jump(chain, q, v, R, p, V)
+    v, impulse = _jump(chain, q, v, R, p, V, held, restitution)
     return chain, q, v, impulse
 
 
@@ -169,6 +184,17 @@ def _carry(chain, value, known, R, p):
     return rederived(replace(chain, joint_value=jnp.where(present, rows, old)))
 
 
+def _closed(chain, R, p):
+    """The frames of the loops with frame b moved to where frame a is."""
+    eye = jnp.eye(3, dtype=R.dtype)[None]
+    R, p = jnp.concatenate([R, eye]), jnp.concatenate([p, jnp.zeros((1, 3), p.dtype)])
+    a, b, frame = chain.loop_index[LoopRow.A], chain.loop_index[LoopRow.B], chain.loop_value[:, :12]
+    back = jnp.swapaxes(R[b], 1, 2)
+    x = p[a] + (R[a] @ frame[:, 9:, None])[..., 0] - p[b]
+    turned = back @ R[a] @ frame[:, :9].reshape(-1, 3, 3)
+    return jnp.concatenate([frame, turned.reshape(-1, 9), (back @ x[..., None])[..., 0]], 1)
+
+
 def _state(chain, base_pose, R, V, rate):
     """q after the change, and the guess v0 from the base's twist and the joint rates."""
     joint, nb, nv = chain.joint_index, chain.capacity.base_nq, chain.capacity.base_nv
@@ -190,8 +216,8 @@ def _places(start, count, width: int, first: int, size: int):
     return jnp.where(jnp.arange(width) < count[:, None], at, size)
 
 
-def _jump(chain, q, v0, R, p, V):
-    """v after the impact, and the impulsive wrench that reaches each link."""
+def _jump(chain, q, v0, R, p, V, held, restitution):
+    """v after the impact, and the impulsive wrench that reaches each link and each loop."""
     pose, index = pose_of(chain, q), chain.link_index
     # twists before, about the base's origin and in its axes
     w, u = V[:, :3], V[:, 3:] + jnp.cross(V[:, :3], pose.p - p)
@@ -202,10 +228,29 @@ def _jump(chain, q, v0, R, p, V):
     J = jacobian_columns(chain, pose, S[..., 0], index[LinkRow.SLOT])
     h = jnp.where(present, link_momenta(chain, Rb, pb, V - V0), 0)
     dv = solve_mass(chain, q, jnp.einsum("nkv,nk->v", J, h))
+    about = lambda F, x: jnp.concatenate([(F[:, :3] - jnp.cross(x, F[:, 3:])) @ pose.R.T, F[:, 3:] @ pose.R.T], 1)
+    of_loops = jnp.zeros((0, 6), q.dtype)
+    if chain.capacity.rows:
+        more, lam = _stop(chain, q, v0 + dv, held, restitution)
+        ends, dv = ends_of(chain, pose, Rb, pb), dv + more
+        F = wrenches(chain, ends, lam)
+        h, of_loops = h + at_links(chain, F), about(F, ends.xa)
     dh = jnp.where(present, link_momenta(chain, Rb, pb, jnp.einsum("nkv,v->nk", J, dv)), 0) - h
-    total = _subtree_sums(index[LinkRow.PARENT], dh)
-    moment = total[:, :3] - jnp.cross(pb, total[:, 3:])
-    return v0 + dv, jnp.concatenate([moment @ pose.R.T, total[:, 3:] @ pose.R.T], 1)
+    of_links = about(_subtree_sums(index[LinkRow.PARENT], dh), pb)
+    return v0 + dv, jnp.concatenate([of_links, of_loops])
+
+
+def _stop(chain, q, v, held, restitution):
+    """What closures change of v, and their impulses: first those that were there before, then all, with restitution.
+
+    The rates at which new loops meet are those that the old ones allow; one factor for all of them keeps energy from
+    growing.
+    """
+    system = delassus(chain, q)
+    new = ~held[chain.row_index[ClosureRow.LOOP]]
+    old = system.multipliers(-(system.K @ v), new.astype(q.dtype))
+    lam = system.multipliers(-(1 + restitution) * (system.K @ (v + system.Y @ old)))
+    return system.Y @ (old + lam), old + lam
 
 
 def _subtree_sums(parent, x):

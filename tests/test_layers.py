@@ -21,12 +21,12 @@ HOST = [
     ["models"],
 ]
 DEVICE = [
-    ["chain", "materialise", "batching"],
+    ["chain", "materialise", "batching", "semidefinite"],
     ["merge", "spatial", "rotation"],
     ["pack", "sweep", "inputs", "coordinates"],
     ["rnea", "crba", "aba"],
     ["kinematics"],
-    ["dynamics", "closures", "delassus", "constraints"],
+    ["dynamics", "closures", "delassus", "constraints", "drift"],
     ["momentum", "params"],
     ["transition", "integrate"],
     ["rollout"],

@@ -66,3 +66,59 @@ def test_loops_of_trees(name, loop):
     close(residual, 0 * residual, 1e-14, scale=1.0)  # 1.3e-15
     assert (status.rank == at).all() and not np.asarray(status.singular).any()
     assert not np.asarray(status.error).max() > 2e-13  # 2.3e-14
+
+
+# -- grapples ----------------------------------------------------------------------------------------------------------
+
+
+@cache
+def grapples(name):
+    """A free tree, its tip tied to the ground by a closure, and the same with the tip as a grounded base."""
+    mine, tip = robot(name), f"l{int(oracles.raw(f'{name}_grapple')['tip_link'])}"
+    variants = mine, mine.close(sdyn.Frame("tip", tip), "ground", name="grip"), mine.reroot(tip).ground(tip)
+    size = sdyn.capacity(variants)
+    return tip, [sdyn.pack(x, size) for x in variants]
+
+
+def grapple(before, after, q, v, tau, gravity):
+    """The state after, its accelerations, and what a judge of the jump needs."""
+    chain, q, v, impulse = sdyn.transfer(before, after, q, v)
+    vdot, lam, status = sdyn.constrained_dynamics(chain, q, v, tau, gravity=gravity)
+    totals = sdyn.momentum(chain, q, v), sdyn.centre_of_mass(chain, q), sdyn.kinetic_energy(chain, q, v)
+    return chain, q, v, impulse, vdot, lam, status, sdyn.body_poses(chain, q), totals
+
+
+GRAPPLE = jax.jit(jax.vmap(grapple, (None, None, 0, 0, 0, None)), **QUICKLY)
+
+
+@pytest.mark.parametrize("name", oracles.TREES)
+def test_grapples(name):
+    """The plastic jump, its impulse, and the accelerations after it: as a closure to ground, and as a grounded base."""
+    tip, (free, tied, fixed) = grapples(name)
+    data, world = oracles.tree(f"{name}_grapple"), oracles.raw(f"{name}_grapple")
+    q, v = sdyn.pad(free, data["q"], data["nu_before"])
+    tau = sdyn.pad(free, data["q"], data["tau"])[1]
+    *_, totals = GRAPPLE(free, free, q, v, tau, data["gravity"])
+    _, _, v1, impulse, vdot, lam, status, (R, p), after = GRAPPLE(free, tied, q, v, tau, data["gravity"])
+    n, k, nv = free.capacity.links, free.capacity.link_names.index(tip), 6 + free.capacity.nv
+    close(v1, data["nu_after"], 1e-13)  # 1.1e-14
+    close(vdot, data["nudot"], 2e-13)  # 2.3e-14
+    turn = lambda x: np.einsum("sij,sj->si", R[:, k], x)
+    close(turn(lam[:, 3:]), world["lam"][:, :3], 1e-13, scale=world["lam"])  # 8.1e-15
+    close(turn(lam[:, :3]), world["lam"][:, 3:], 1e-13, scale=world["lam"])
+    assert (status.rank == 6).all()
+
+    # the impulse of the closure is the jump of momentum, and what the ground gives to the base that is grounded there
+    at_tip = np.asarray(impulse)[:, n]
+    close(at_tip[:, 3:], world["impulse_on_tip"][:, :3], 1e-13)  # 1.2e-14
+    close(at_tip[:, :3], world["impulse_on_tip"][:, 3:], 1e-13, scale=at_tip)
+    (h0, *_, T0), (h1, c, T1) = totals, after
+    arm = np.asarray(p)[:, k] - np.asarray(c)
+    close(h1 - h0, np.concatenate([at_tip[:, :3] + np.cross(arm, at_tip[:, 3:]), at_tip[:, 3:]], 1), 2e-14)  # 1.8e-15
+    assert (T1 < T0).all()
+    only_joints = np.asarray(tau) * (np.arange(nv) >= 6)
+    _, _, v2, by_ground, a, *_ = GRAPPLE(free, fixed, q, v, only_joints, data["gravity"])
+    close(np.asarray(by_ground)[:, k], at_tip, 2e-13)  # 1.3e-14
+    close(v2[:, 6:], v1[:, 6:], 2e-13)  # 2.4e-14
+    b = GRAPPLE(free, tied, q, v, only_joints, data["gravity"])[4]
+    close(np.asarray(a)[:, 6:], np.asarray(b)[:, 6:], 1e-12)
