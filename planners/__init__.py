@@ -9,5 +9,5 @@ plan.save("out/grasp")
 from planners.certify import Certificate, certify
 from planners.compare import Table, compare
 from planners.driver import plan
-from planners.plan import PhaseResult, Plan
+from planners.plan import PhaseResult, Plan, PlanError
 from planners.task import Task, TaskError, load

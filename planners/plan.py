@@ -1,11 +1,12 @@
 """Plans: what a planner found, kept as plain arrays, saved and loaded."""
 
 import hashlib
+import io
 import json
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,12 @@ import numpy as np
 import sdyn
 from planners.task import Task, parse
 
-FORMAT = 1
+FORMAT = 2
+NEEDED = ("plan.npz", "certificate.json")  # of the files that plan.json names
+
+
+class PlanError(ValueError):
+    """Files that are not those of one plan."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,9 @@ class Plan:
     def save(self, folder) -> None:
         """Writes plan.npz, plan.json, certificate.json, figures and plan.html into a folder, all or none.
 
-        The files are made in a folder beside it, which then takes its place file by file.
+        The files are made in a folder beside it and then moved, plan.json last. It names the hashes of the others, so
+        that `load` refuses what a save that was killed between two moves leaves behind. Files of an earlier plan that
+        this one has not are removed; what else is in the folder stays.
         """
         folder = Path(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -74,8 +82,12 @@ class Plan:
         try:
             self._write(made)
             folder.mkdir(exist_ok=True)
-            for path in sorted(made.iterdir()):
-                os.replace(path, folder / path.name)
+            names = sorted((path.name for path in made.iterdir()), key=lambda name: (name == "plan.json", name))
+            old = _named(folder) - set(names)
+            for name in names:
+                os.replace(made / name, folder / name)
+            for name in old:
+                (folder / name).unlink(missing_ok=True)
         finally:
             shutil.rmtree(made)
 
@@ -83,25 +95,33 @@ class Plan:
         from planners import animation, figures
 
         np.savez(folder / "plan.npz", **_arrays(self))
-        (folder / "plan.json").write_text(json.dumps(_description(self), indent=1) + "\n", encoding="utf-8")
         if self.certificate is not None:
             (folder / "certificate.json").write_text(self.certificate.to_json() + "\n", encoding="utf-8")
         figures.draw(self, folder)
         animation.write(self, folder / "plan.html")
+        files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+        said = _description(self) | {"files": files}
+        (folder / "plan.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, folder) -> "Plan":
-        """Reads a plan; its robots are made again from the task."""
+        """Reads a plan; its robots are made again from the task.
+
+        Raises:
+            PlanError: If the files in the folder are not those of one plan.
+        """
         from planners.certify import Certificate
 
         folder = Path(folder)
         said = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
-        with np.load(folder / "plan.npz", allow_pickle=False) as file:
+        read = _read(folder, said)
+        with np.load(io.BytesIO(read["plan.npz"]), allow_pickle=False) as file:
             arrays = dict(file)
         place = {"folder": Path(said["task"]["folder"])} if said["task"]["folder"] else {}
         task = parse(said["task"]["text"], said["task"]["name"], **place)
         part = lambda key: {k[len(key) + 1 :]: x for k, x in arrays.items() if k.startswith(key + ".")}
-        plan = cls(
+        certificate = read.get("certificate.json")
+        return cls(
             task,
             tuple(_phase(task, name, part(f"phase.{name}")) for name in task.phases),
             said["status"],
@@ -111,9 +131,34 @@ class Plan:
             arrays["history"],
             said["timing"],
             said["info"],
+            None if certificate is None else Certificate.from_json(certificate.decode()),
         )
-        path = folder / "certificate.json"
-        return replace(plan, certificate=Certificate.from_json(path.read_text())) if path.is_file() else plan
+
+
+def _read(folder, said) -> dict[str, bytes]:
+    """What is in the files that plan.json names, each with the hash that it names."""
+    version = said.get("version") if isinstance(said, dict) else None
+    if version != FORMAT:
+        raise PlanError(f"plan.json has the version {version!r}; this sdyn reads {FORMAT}")
+    out = {}
+    for name, digest in said["files"].items():
+        path = folder / name
+        if name in NEEDED or path.is_file():  # a figure may be thrown away, but not be another plan's
+            out[name] = path.read_bytes()
+            if hashlib.sha256(out[name]).hexdigest() != digest:
+                raise PlanError(
+                    f"{name} is not the one that plan.json names: saving was interrupted, or it was changed"
+                )
+    return out
+
+
+def _named(folder) -> set[str]:
+    """Names of the files of the plan in a folder, if there is one."""
+    try:
+        names = json.loads((folder / "plan.json").read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
+    return {name for name in names if Path(name).name == name}
 
 
 def _arrays(plan):

@@ -173,9 +173,7 @@ def view(folder: PlanWord) -> int:
     """
     page = folder / "plan.html"
     if not page.is_file():
-        from planners import animation
-
-        animation.write(_plan_in(folder), page)
+        _plan_in(folder).save(folder)
     _say(str(page.resolve()))
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform in ("darwin", "win32"):
         import webbrowser
