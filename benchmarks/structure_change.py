@@ -17,6 +17,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import subjects
 
 import sdyn
 from sdyn.pack import _arrays  # `pack` without the copy to the device
@@ -52,16 +53,6 @@ def timed(edit, capacity, repeats=REPEATS):
     return 1e3 * np.array(rows)
 
 
-def long_robots(joints=1000):
-    """A chain and a bush of many joints."""
-    links = [sdyn.Link(f"l{k}", 1.0, (0, 0, 0.05), 0.01 * np.eye(3)) for k in range(joints + 1)]
-    place = dict(position=(0, 0, 0.1), axis=(1, 0, 0))
-    hang = lambda parent: [
-        sdyn.Joint(f"j{k}", "revolute", f"l{parent(k)}", f"l{k + 1}", **place) for k in range(joints)
-    ]
-    return {"chain": sdyn.Robot(links, hang(lambda k: k)), "bush": sdyn.Robot(links, hang(lambda k: 0))}
-
-
 def row(host, **rest):
     """Median, spread and best of the time on the host."""
     low, median, high = np.percentile(host, (10, 50, 90))
@@ -88,7 +79,8 @@ def main():
             f"pack {packed:.2f}; copy to the device {copied:.2f}"
         )
     print(f"compilations: {len(compiled)}")
-    long = {name: timed(lambda x=x: x, sdyn.capacity([x]), repeats=10) for name, x in long_robots().items()}
+    long = {"chain": subjects.chain(1000), "bush": subjects.bush(1000)}
+    long = {name: timed(lambda x=x: x, sdyn.capacity([x]), repeats=10) for name, x in long.items()}
     for name, times in long.items():
         print(f"pack a {name} of 1000 joints: {np.median(times[:, 1]):.0f} ms")
     result = dict(

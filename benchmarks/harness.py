@@ -1,0 +1,141 @@
+"""How all benchmarks measure: one thread, contenders in turn, medians with their spread, the machine named.
+
+A shared machine drifts: so what is to be compared is timed in turns, round after round, and a ratio is the median of
+the ratios within a round.
+"""
+
+import gc
+import importlib.metadata
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results"
+ROUNDS, LEAST = 15, 0.03  # of each contender; seconds that one timing lasts at least
+ONE_THREAD = dict(
+    XLA_FLAGS="--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    OMP_NUM_THREADS="1",
+    OPENBLAS_NUM_THREADS="1",
+    JAX_PLATFORMS="cpu",
+    JAX_ENABLE_X64="1",
+)
+
+
+def one_thread():
+    """Keep this process, and what it starts, to one thread on one core; before JAX is imported."""
+    os.environ |= ONE_THREAD
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+class Contender(NamedTuple):
+    """Something to be timed."""
+
+    run: Callable[[int], object]
+    """Does the work so many times and returns when all of it is done."""
+    samples: int
+    """Samples in one of these times."""
+
+
+def loop(f, *args, carry: int):
+    """`f(*args)` over and over in one compiled loop; each turn waits for the last, through `args[carry]`.
+
+    Args:
+        f: A function of the arguments that returns an array like `args[carry]`.
+        *args: Arguments; copied to the device once.
+        carry: Which of them a turn changes, by a billionth of the result.
+    """
+    import jax
+
+    args = jax.device_put(args)
+
+    @jax.jit
+    def turns(n, *args):
+        def turn(_, x):
+            y = f(*args[:carry], x, *args[carry + 1 :])
+            return jax.tree.map(lambda a, b: a + (1e-9 * b).astype(a.dtype), x, y)
+
+        return jax.lax.fori_loop(0, n, turn, args[carry])
+
+    return lambda n: jax.block_until_ready(turns(n, *args))
+
+
+def calls(f):
+    """`f()` over and over from Python."""
+
+    def run(n):
+        for _ in range(n):
+            f()
+
+    return run
+
+
+def seconds(run: Callable[[int], object], n: int) -> float:
+    """How long it runs."""
+    start = time.perf_counter()
+    run(n)
+    return time.perf_counter() - start
+
+
+def times(contenders: dict[str, Contender], rounds: int = ROUNDS) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Seconds per sample of each contender in each round, and the seconds of its first call, which may compile."""
+    turns, first = dict.fromkeys(contenders, 1), {}
+    for name, contender in contenders.items():
+        first[name] = round(seconds(contender.run, 1), 3)
+        while seconds(contender.run, turns[name]) < LEAST:
+            turns[name] *= 2
+    out = {name: [] for name in contenders}
+    gc.collect()
+    gc.disable()
+    for _ in range(rounds):
+        for name, contender in contenders.items():
+            out[name].append(seconds(contender.run, turns[name]) / turns[name] / contender.samples)
+    gc.enable()
+    return {name: np.array(x) for name, x in out.items()}, first
+
+
+def spread(x) -> dict[str, float]:
+    """Median, 10th and 90th percentile of seconds, in microseconds."""
+    low, median, high = (round(float(y), 4) for y in np.percentile(1e6 * np.asarray(x), (10, 50, 90)))
+    return dict(median_us=median, p10_us=low, p90_us=high)
+
+
+def ratio(slow, fast) -> float:
+    """How many times faster the second is: the median over the rounds."""
+    return round(float(np.median(np.asarray(slow) / np.asarray(fast))), 3)
+
+
+def machine(*packages: str) -> dict:
+    """What was measured on."""
+    cpu = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").is_file():
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), cpu)
+    versions = {}
+    for package in ("sdyn", "jax", "jaxlib", "numpy", *packages):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return dict(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        cpu=cpu,
+        cores=os.cpu_count(),
+        load=round(os.getloadavg()[0], 2),
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        versions=versions,
+    )
+
+
+def save(name: str, result: dict):
+    """Keep a result in results/NAME.json."""
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")

@@ -1,0 +1,92 @@
+"""The table and the chart of results/speed.json; run it to see the kept results again."""
+
+import json
+
+import harness
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+LOOK = dict(box=None, title_justify="left", padding=(0, 2, 0, 0))
+
+
+def show(result):
+    """Print what was measured; at 80 columns nothing is cut."""
+    console = Console(highlight=False, width=min(Console().width, 100))
+    say = lambda text: console.print(Text(text), soft_wrap=not console.is_terminal)
+    versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items() if version)
+    say(f"{result['cpu']}, one thread on one core of {result['cores']}, load {result['load']}; {versions}")
+    for peer, reason in result["absent"].items():
+        say(f"{peer} was left out: {reason}")
+    worst = max(x for errors in result["agreement"].values() for k, x in errors.items() if "float32" not in k)
+    single = max(errors["sdyn, float32"] for errors in result["agreement"].values())
+    say(f"accelerations agree to {worst:.0e} (float32: {single:.0e}) of the largest one")
+    console.print(_ratios(result))
+    console.print(_times(result))
+    cold, change, long = result["cold_compile"], result["structure_change"], result["long_chain"]
+    say(f"cold compile of forward dynamics: {cold['compile_s']:.1f} s, and {cold['trace_s']:.1f} s of tracing")
+    say(f"structure change, edit and pack: {change['median_us'] / 1e3:.2f} ms")
+    say(
+        f"chain of {long['joints']} joints: {long['median_us']:.0f} us a sample, {long['times_ten_times_shorter']:.1f} "
+        f"times one of a tenth; error {long.get('error_against_mujoco', float('nan')):.0e} against MuJoCo, "
+        f"{long['round_trip_error']:.0e} of the round trip; {long['memory_bytes'] / 2**20:.0f} MiB for {long['batch']}"
+    )
+
+
+def _ratios(result):
+    table = Table(title="How many times faster, robot paper37", **LOOK)
+    for column, side in (("what", "left"), ("against", "left"), ("us", "right"), ("us", "right"), ("ratio", "right")):
+        table.add_column(column, justify=side)
+    for row in result["ratios"]:
+        slow, fast = (result["time"]["paper37"][row[key]]["median_us"] for key in ("slow", "fast"))
+        table.add_row(row["what"], row["slow"], f"{slow:.2f}", f"{fast:.2f}", Text(f"{row['ratio']:.2f}", "bold"))
+    return table
+
+
+def _times(result):
+    table = Table(
+        title="Time per sample, us: median (10 to 90 %)", box=None, title_justify="left", padding=(0, 2, 0, 0)
+    )
+    names = list(result["time"])
+    table.add_column("forward dynamics")
+    for name in names:
+        table.add_column(name, justify="right")
+    for key in result["time"]["iiwa_free"]:
+        cells = []
+        for name in names:
+            x = result["time"][name].get(key)
+            cells.append(f"{x['median_us']:.2f} ({x['p10_us']:.2f} to {x['p90_us']:.2f})" if x else "")
+        table.add_row(key, *cells)
+    return table
+
+
+def chart(result, path):
+    """Time per sample of every library on every robot."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    keys = [key for key in result["time"]["iiwa_free"] if "width" not in key or key.endswith("width 1")]
+    figure, panels = plt.subplots(1, len(result["time"]), figsize=(12, 0.4 * len(keys) + 1.4), sharey=True)
+    for axes, (name, times) in zip(panels, result["time"].items(), strict=True):
+        medians = [times[key]["median_us"] for key in keys]
+        spread = [[times[key]["median_us"] - times[key]["p10_us"] for key in keys]]
+        spread.append([times[key]["p90_us"] - times[key]["median_us"] for key in keys])
+        colours = ["#1f6fb4" if key.startswith("sdyn") else "#9aa5b1" for key in keys]
+        axes.barh(keys, medians, xerr=spread, color=colours, ecolor="#444444")
+        for k, x in enumerate(medians):
+            axes.annotate(f" {x:.2g}", (x, k), va="center", fontsize=8)
+        axes.set(xscale="log", title=name, xlabel="us a sample")
+        axes.margins(x=0.2)
+    panels[0].invert_yaxis()
+    figure.suptitle(f"Forward dynamics, one thread, {result['cpu']}")
+    figure.tight_layout()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    kept = json.loads((harness.RESULTS / "speed.json").read_text())
+    show(kept)
+    chart(kept, harness.RESULTS / "speed.png")
