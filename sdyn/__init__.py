@@ -20,7 +20,16 @@ from sdyn.dynamics import bias_force, inverse_dynamics, mass_matrix, solve_mass
 from sdyn.closures import loop_jacobian, loop_residual, loop_wrenches
 from sdyn.constraints import Status, constrained_dynamics, forward_dynamics
 from sdyn.drift import project
-from sdyn.momentum import centre_of_mass, generalised_jacobian, kinetic_energy, momentum
+from sdyn.momentum import centre_of_mass, kinetic_energy, momentum
+from sdyn.floating import (
+    floating_forward_dynamics,
+    floating_inverse_dynamics,
+    floating_velocity,
+    generalised_jacobian,
+    reaction_null_space,
+    reduced_dynamics,
+)
+from sdyn.actuators import frame_wrench, wheels
 from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
 from sdyn.integrate import integrate

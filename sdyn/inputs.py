@@ -10,14 +10,16 @@ def expect(chain: Chain, **arrays) -> tuple:
 
     Args:
         chain: Tells the sizes and the type.
-        **arrays: Named q, v, vdot, tau, b, gravity or f_ext; None stays None.
+        **arrays: Named q, v, vdot, tau, b, gravity or f_ext; rates, accelerations or torques of the joints alone;
+            momentum or wrench. None stays None.
 
     Raises:
         ValueError: If a shape or a floating-point type differs; it names the expected and the given one.
     """
     if chain.slot_index.ndim != 3:
         raise ValueError("the chain is a stacked family; run over it with jax.vmap(f, in_axes=(0, ...)).")
-    shapes = {"q": (chain.nq,), "gravity": (3,), "f_ext": (chain.capacity.links, 6)}
+    shapes = {"q": (chain.nq,), "gravity": (3,), "f_ext": (chain.capacity.links, 6), "momentum": (6,), "wrench": (6,)}
+    shapes |= dict.fromkeys(("rates", "accelerations", "torques"), (chain.capacity.nv,))
     out = []
     for name, x in arrays.items():
         if x is not None:

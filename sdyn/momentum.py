@@ -1,13 +1,12 @@
-"""Energy, momentum and centre of mass, and the Jacobian of a free-floating frame at given momentum."""
+"""Energy, momentum and centre of mass."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sdyn.chain import BaseRow, Chain, LinkRow
+from sdyn.chain import Chain, LinkRow
 from sdyn.coordinates import pose_of, rates_of
-from sdyn.dynamics import mass_matrix
 from sdyn.inputs import expect
-from sdyn.kinematics import frame_jacobian, link_motions, link_poses, poses
+from sdyn.kinematics import link_motions, link_poses, poses
 
 
 def centre_of_mass(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "3"]:
@@ -51,30 +50,6 @@ def kinetic_energy(chain: Chain, q: Float[Array, " nq"], v: Float[Array, " nv"])
     R, p, V, _ = link_motions(chain, pose, v, jnp.zeros_like(v))
     _, qd = rates_of(chain, pose, v)
     return 0.5 * ((V * link_momenta(chain, R, p, V)).sum() + (chain.dof_value[2] * qd[:, 0] ** 2).sum())
-
-
-def generalised_jacobian(chain: Chain, q: Float[Array, " nq"], frame) -> Float[Array, "6 joints"]:
-    """Jacobian of a frame with respect to the joints alone, the free base reacting at zero momentum.
-
-    Args:
-        chain: Packed structure; the plain joint Jacobian when the base is grounded.
-        q: Configuration.
-        frame: Name, or index, which may be traced.
-
-    Returns:
-        J_m - J_b M_bb^-1 M_bm, angular rows first, world axes, at the frame's origin.
-
-    Source:
-        Umetani and Yoshida, Resolved motion rate control of space manipulators (1989).
-    """
-    (q,) = expect(chain, q=q)
-    J = frame_jacobian(chain, q, frame)
-    if chain.capacity.base_nv == 0:
-        return J
-    M = mass_matrix(chain, q)
-    # a grounded base of the padded layout has no mass; its columns of J are zero
-    Mbb = M[:6, :6] + jnp.eye(6, dtype=M.dtype) * (1 - chain.base_value[BaseRow.FREE])
-    return J[:, 6:] - J[:, :6] @ jnp.linalg.solve(Mbb, M[:6, 6:])
 
 
 def link_momenta(chain: Chain, R, p, V):

@@ -27,7 +27,7 @@ DEVICE = [
     ["rnea", "crba", "aba"],
     ["kinematics"],
     ["dynamics", "closures", "delassus", "constraints", "drift"],
-    ["momentum", "params"],
+    ["momentum", "params", "floating", "actuators"],
     ["transition", "integrate"],
     ["rollout"],
 ]
