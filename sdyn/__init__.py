@@ -33,4 +33,4 @@ from sdyn.actuators import frame_wrench, wheels
 from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
 from sdyn.integrate import integrate
-from sdyn.rollout import rollout
+from sdyn.rollout import Phases, hybrid_rollout, rollout

@@ -52,13 +52,14 @@ def integrate(
 
 
 def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_ext=None):
-    """`integrate`, with the force as a function of time and state that every stage evaluates."""
+    """`integrate`, with the force (and f_ext, if it is callable) as a function of time and state, for every stage."""
     dt = jnp.asarray(dt, chain.dtype)
     project = isinstance(drift, str)
     if project and drift != "project":
         raise ValueError(f"integrate: drift is {drift!r}; it must be 'project' or a Baumgarte rate [1/s].")
-    options = dict(gravity=gravity, f_ext=f_ext) | ({} if project else dict(baumgarte=drift))
-    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), **options)
+    options = dict(gravity=gravity) | ({} if project else dict(baumgarte=drift))
+    wrenches = f_ext if callable(f_ext) else lambda t, q, v: f_ext
+    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), f_ext=wrenches(t, q, v), **options)
     if method == "rk4":
         q, v = _rk4(chain, q, v, acceleration, t, dt)
     elif method == "semi_implicit":

@@ -1,4 +1,12 @@
-"""Many steps in one scan, with a schedule of structures: what planners differentiate."""
+"""Many steps in one scan, and phases of other structures in a scan of scans: what planners differentiate.
+
+A phase of duration T in N steps has the step T / N, so a switch time is data like any other. Its derivative comes
+out of those of the steps and of `transfer`: a switch that is later by dt moves the state behind it by
+    (Dg f− − f+) dt,
+with x+ = g(x−) the transfer and f−, f+ the rates of the state on either side: what makes Dg the saltation matrix.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,61 +27,130 @@ def rollout(
     dt,
     *,
     method: str = "rk4",
+    drift="project",
     steps: int | None = None,
-    schedule: Int[Array, " nt"] | None = None,
     gravity: Float[Array, "3"] | None = None,
-    f_ext: Float[Array, "n 6"] | None = None,
+    f_ext=None,
 ) -> tuple[Float[Array, "nt+1 nq"], Float[Array, "nt+1 nv"]]:
-    """States along a motion.
+    """States along a motion of one structure.
 
     Args:
-        chain: Packed structure; or, with a schedule, a stacked `family`.
-        q, v: State at the start; of the first member of the schedule.
+        chain: Packed structure.
+        q, v: State at the start.
         taus: Forces [nt, nv], constant over a step; or a function (t, q, v) -> [nv], evaluated at every stage.
         dt: Step [s].
-        method: As for `integrate`.
+        method, drift: As for `integrate`.
         steps: Number of steps, static; needed where taus is a function.
-        schedule: Member of the family in each step. Where it changes, the state is transferred; lock values, ground
-            pose and placements come from the state.
-        gravity, f_ext: As for `forward_dynamics`, constant.
+        gravity: As for `forward_dynamics`.
+        f_ext: Wrenches on the links [n, 6], constant; or a function (t, q, v) -> [n, 6], evaluated at every stage.
 
     Returns:
-        qs, vs: States at the ends of the steps, the start first; at a change, the state before it.
+        qs, vs: States at the ends of the steps, the start first.
     """
-    force, steps = _force(taus, steps)
-    first = chain if schedule is None else jax.tree.map(lambda x: x[schedule[0]], chain)
-    q, v = expect(first, q=q, v=v)
-    options = dict(method=method, gravity=gravity, f_ext=f_ext)
-
-    def advance(chain, q, v, i):
-        return step(chain, q, v, lambda t, q, v: force(i, t, q, v), i * jnp.asarray(dt, q.dtype), dt, **options)
-
-    def alone(state, i):
-        state = advance(chain, *state, i)
-        return state, state
-
-    def in_turn(carry, x):
-        (current, member, q, v), (i, now) = carry, x
-        new = jax.tree.map(lambda x: x[now], chain)
-        change = lambda: transfer(current, new, q, v)[:3]
-        current, q, v = lax.cond(now == member, lambda: (current, q, v), change)
-        q, v = advance(current, q, v, i)
-        return (current, now, q, v), (q, v)
-
-    if schedule is None:
-        _, (qs, vs) = lax.scan(alone, (q, v), jnp.arange(steps))
-    else:
-        _, (qs, vs) = lax.scan(in_turn, (first, schedule[0], q, v), (jnp.arange(steps), schedule))
+    force, steps = _force("rollout", taus, steps, 0)
+    q, v = expect(chain, q=q, v=v)
+    t = jnp.asarray(dt, q.dtype) * jnp.arange(steps + 1)
+    qs, vs = _phase(chain, q, v, force, t, dt, method=method, drift=drift, gravity=gravity, f_ext=f_ext)
     return jnp.concatenate([q[None], qs]), jnp.concatenate([v[None], vs])
 
 
-def _force(taus, steps):
-    """The force in step i as a function of time and state, and the number of steps."""
+class Phases(NamedTuple):
+    """A motion through several structures; each phase from the state behind the switch to the one before the next."""
+
+    t: Float[Array, "phases steps+1"]
+    """Times [s]."""
+    q: Float[Array, "phases steps+1 nq"]
+    v: Float[Array, "phases steps+1 nv"]
+    """States, each in the coordinates of its phase's structure."""
+    impulse: Float[Array, "phases n+loops 6"]
+    """What reached each link and loop at the start of the phase, see `transfer`; zero in the first."""
+    chain: Chain
+    """The structures, stacked [phases], with lock values, ground pose and closures as the motion left them."""
+
+
+def hybrid_rollout(
+    family: Chain,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    taus,
+    durations: Float[Array, " phases"],
+    members: Int[Array, " phases"],
+    *,
+    method: str = "rk4",
+    drift="project",
+    steps: int | None = None,
+    gravity: Float[Array, "3"] | None = None,
+    f_ext=None,
+) -> Phases:
+    """A motion through phases of different structure, with `transfer` between them.
+
+    One program for all members, orders and durations. A phase that needs more steps than the others is given as
+    several phases of the same member.
+
+    Args:
+        family: Structures stacked along a leading axis, from `family`.
+        q, v: State at the start, of the first phase's structure, in the layout of the capacity (`pad`).
+        taus: Forces [phases, steps, nv], constant over a step, so that they stretch with the phase; or a function
+            (t, q, v) -> [nv] of the time since the start, which does not.
+        durations: Of the phases [s], not negative; switch times are their running sums.
+        members: Number of each phase's structure in the family.
+        method, drift: As for `integrate`.
+        steps: Steps in each phase, static; needed where taus is a function.
+        gravity, f_ext: As for `rollout`.
+
+    Returns:
+        The phases. Differentiable in everything, the durations included.
+    """
+    force, steps = _force("hybrid_rollout", taus, steps, 1)
+    options = dict(method=method, drift=drift, gravity=gravity, f_ext=f_ext)
+    pick = lambda member: jax.tree.map(lambda x: x[member], family)
+    first = pick(members[0])
+    q, v = expect(first, q=q, v=v)
+    durations = jnp.asarray(durations, q.dtype)
+    (count,) = durations.shape
+    if jnp.shape(members) != (count,):
+        raise ValueError(f"hybrid_rollout: {count} durations and members of shape {jnp.shape(members)}; one for each.")
+    if not callable(taus) and len(jnp.asarray(taus)) != count:
+        raise ValueError(f"hybrid_rollout: taus has {len(taus)} phases and there are {count} durations.")
+    starts = jnp.cumsum(durations) - durations
+    times = starts[:, None] + durations[:, None] * (jnp.arange(steps + 1) / steps)
+    none = jnp.zeros((first.capacity.links + first.capacity.loops, 6), q.dtype)
+
+    def phase(state, x):
+        k, member, t, duration = x
+        stay = lambda: (*state, none)
+        chain, q, v, impulse = lax.cond(k == 0, stay, lambda: transfer(state[0], pick(member), *state[1:]))
+        f = lambda i, t, q, v: force((k, i), t, q, v)
+        qs, vs = _phase(chain, q, v, f, t, duration / steps, **options)
+        path = jnp.concatenate([q[None], qs]), jnp.concatenate([v[None], vs])
+        return (chain, qs[-1], vs[-1]), Phases(t, *path, impulse, chain)
+
+    _, found = lax.scan(phase, (first, q, v), (jnp.arange(count), jnp.asarray(members), times, durations))
+    return found
+
+
+def _phase(chain, q, v, force, times, dt, **options):
+    """States at the ends of the steps that start at times[:-1]."""
+
+    def advance(state, x):
+        i, t = x
+        state = step(chain, *state, lambda t, q, v: force(i, t, q, v), t, dt, **options)
+        return state, state
+
+    _, found = lax.scan(advance, (q, v), (jnp.arange(len(times) - 1), times[:-1]))
+    return found
+
+
+def _force(name, taus, steps, axis: int):
+    """The force in step i as a function of time and state, and the number of steps, along `axis` of an array."""
     if callable(taus):
         if steps is None:
-            raise ValueError("rollout: taus is a function; say how many steps with steps=.")
+            raise ValueError(f"{name}: taus is a function; say how many steps with steps=.")
         return (lambda i, t, q, v: taus(t, q, v)), steps
     taus = jnp.asarray(taus)
-    if steps not in (None, len(taus)):
-        raise ValueError(f"rollout: steps is {steps} and taus has {len(taus)} rows; leave steps out.")
-    return (lambda i, t, q, v: taus[i]), len(taus)
+    if taus.ndim != axis + 2:
+        want = "[phases, steps, nv]" if axis else "[nt, nv]"
+        raise ValueError(f"{name}: taus has shape {taus.shape}; it is {want}, or a function (t, q, v).")
+    if steps not in (None, taus.shape[axis]):
+        raise ValueError(f"{name}: steps is {steps} and taus has {taus.shape[axis]} rows; leave steps out.")
+    return (lambda i, t, q, v: taus[i]), taus.shape[axis]

@@ -44,6 +44,7 @@ SIGNATURES = {
     "transfer": ("before after q v", ""),
     "integrate": ("chain q v tau dt", "method gravity f_ext"),
     "rollout": ("chain q v taus dt", "method gravity f_ext steps"),
+    "hybrid_rollout": ("family q v taus durations members", "method gravity f_ext steps"),
     "regressor": ("chain q v vdot", ""),
     "params": ("chain", ""),
     "with_params": ("chain params", ""),

@@ -275,7 +275,7 @@ def test_exact_layout_equals_capacity():
         close(a.base_value[-7:], b.base_value[-7:], 2e-15)  # 0
 
 
-# -- derivatives, schedules --------------------------------------------------------------------------------------------
+# -- derivatives ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("change", ["lock and re-root", "grapple", "unlock"])
@@ -319,44 +319,3 @@ def transfer_slope(found=[]):  # noqa: B006  (compiled once)
     if not found:
         found.append(jax.jit(jax.value_and_grad(value, 2), **QUICKLY))
     return found[0]
-
-
-MEMBERS = [TREE, TREE.lock(LOCKS), TREE.lock(LOCKS).reroot("l8"), TREE]
-SCHEDULE, STEP = np.repeat([0, 1, 2, 3], [2, 3, 1, 2]), 0.05
-
-
-def motion_of(rng):
-    """A family, the start and forces of a rollout over changes of structure."""
-    family = jax.tree.map(lambda *x: jnp.stack(x), *map(pack, MEMBERS))
-    x = padded(TREE, pack(TREE), states(TREE, "schedule"))
-    return family, x, 0.1 * rng.normal(size=(len(SCHEDULE), x.v.shape[1])) * real(MEMBERS[1])
-
-
-def roll(family, q, v, taus, gravity):
-    return sdyn.rollout(family, q, v, taus, STEP, schedule=SCHEDULE, method="semi_implicit", gravity=gravity)
-
-
-def test_schedule_equals_pieces(rng):
-    """A rollout over changes of structure, against pieces with transfers by hand."""
-    family, x, taus = motion_of(rng)
-    qs, vs = jax.jit(roll, **QUICKLY)(family, x.q[0], x.v[0], taus, x.gravity[0])
-    assert qs.shape == (len(SCHEDULE) + 1, x.q.shape[1])
-    step = jax.jit(partial(sdyn.integrate, method="semi_implicit"), **QUICKLY)
-    chain, q, v = pack(MEMBERS[0]), x.q[0], x.v[0]
-    for i, now in enumerate(SCHEDULE):
-        if i and now != SCHEDULE[i - 1]:
-            chain, q, v, _ = TRANSFER(chain, pack(MEMBERS[now]), q, v)
-        q, v = step(chain, q, v, taus[i], STEP, gravity=x.gravity[0])
-        close(qs[i + 1], q, 2e-15)  # 0
-        close(vs[i + 1], v, 2e-15)  # 0
-
-
-@pytest.mark.slow
-def test_gradient_of_a_schedule(rng):
-    """Of the end of a rollout over changes of structure with respect to its start, against differences."""
-    family, x, taus = motion_of(rng)
-    w = np.cos(np.arange(x.v.shape[1]))
-    end = lambda v: w @ roll(family, x.q[0], v, taus, x.gravity[0])[1][-1]
-    run = jax.jit(jax.value_and_grad(end), **QUICKLY)
-    along = rng.normal(size=x.v[0].shape) * real(TREE)
-    close(run(x.v[0])[1] @ along, differences(lambda v: run(v)[0], x.v[0], along, 1e-4), 1e-8, scale=1.0)
