@@ -19,31 +19,30 @@ def batched(f):
     return lambda chain, *x: jax.vmap(f, (None, *(0,) * len(x)))(chain, *x)
 
 
-def forward(robot, batch: int, *, dtype="float64", width=None, capacity=None, f=sdyn.forward_dynamics) -> Contender:
+def forward(robot, batch: int, *, dtype="float64", width=None, capacity=None, all_at_once=None) -> Contender:
     """Forward dynamics of `batch` states in a compiled loop; batch 1 is one state, without vmap."""
     chain = sdyn.pack(robot, capacity, width=width, dtype=dtype)
     q, v, tau = peers.states(robot, batch)
     if capacity is not None:
         (q, v), (_, tau) = sdyn.pad(chain, q, v), sdyn.pad(chain, q, tau)
-    q, v, tau = (jnp.asarray(x, dtype) for x in (q, v, tau))
-    if batch == 1:
-        return Contender(loop(f, chain, q[0], v[0], tau[0], carry=3), 1)
-    return Contender(loop(batched(f), chain, q, v, tau, carry=3), batch)
+    x = tuple(jnp.asarray(y[0] if batch == 1 else y, dtype) for y in (q, v, tau))
+    f = sdyn.forward_dynamics if batch == 1 else all_at_once or batched(sdyn.forward_dynamics)
+    return Contender(loop(lambda chain, x: f(chain, *x), chain, x), batch)
 
 
 def gradient(robot, batch: int) -> Contender:
     """Gradient of a scalar of the accelerations with respect to q, v and tau."""
     weights = jnp.asarray(np.random.default_rng(1).normal(size=robot.nv))
-    scalar = lambda chain, x: weights @ sdyn.forward_dynamics(chain, *x)
-    f = batched(jax.grad(scalar, 1))
-    return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch), carry=1), batch)
+    slopes = jax.grad(lambda x, chain: weights @ sdyn.forward_dynamics(chain, *x))
+    f = lambda chain, x: jax.vmap(slopes, (0, None))(x, chain)
+    return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
 
 
 def jacobians(robot, batch: int) -> Contender:
     """All derivatives d vdot / d (q, v, tau)."""
-    f = batched(lambda chain, x: jax.jacfwd(lambda y: sdyn.forward_dynamics(chain, *y))(x))
-    rows = lambda chain, x: jax.tree.map(lambda J: J.sum(1), f(chain, x))  # the next turn waits for every entry
-    return Contender(loop(rows, sdyn.pack(robot), peers.states(robot, batch), carry=1), batch)
+    all_slopes = jax.jacfwd(lambda x, chain: sdyn.forward_dynamics(chain, *x))
+    f = lambda chain, x: jax.tree.map(lambda J: J.sum(1), jax.vmap(all_slopes, (0, None))(x, chain))
+    return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
 
 
 def pinocchio(peer) -> dict[str, Contender]:
@@ -83,9 +82,8 @@ def mujoco(peer) -> dict[str, Contender]:
 
 def in_jax(peer, batch: int) -> dict[str, Contender]:
     """A peer that is written in JAX, in the same loop as ours."""
-    f = jax.vmap(peer.accelerations)
-    wide = lambda q, v, tau: f(q, v, tau)[:, -tau.shape[1] :]  # what is carried has the shape of tau
-    return {f"{peer.name}, batch {batch}": Contender(loop(wide, peer.q, peer.v, peer.tau, carry=2), batch)}
+    f = lambda _, x: jax.vmap(peer.accelerations)(*x)
+    return {f"{peer.name}, batch {batch}": Contender(loop(f, None, (peer.q, peer.v, peer.tau)), batch)}
 
 
 def of_peer(kind, robot, batch: int) -> dict[str, Contender]:

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+FIRST = ("sdyn, batch 256", "MJX, batch 1024", "JaxSim, batch 256")
 LOOK = dict(box=None, title_justify="left", padding=(0, 2, 0, 0))
 
 
@@ -24,6 +25,9 @@ def show(result):
     console.print(_ratios(result))
     console.print(_times(result))
     cold, change, long = result["cold_compile"], result["structure_change"], result["long_chain"]
+    first = result["first_call_s"]["paper37"]
+    seconds = ", ".join(f"{first[key]:.0f} s {key}" for key in first if key in FIRST)
+    say(f"first calls, which compile: {seconds}")
     say(f"cold compile of forward dynamics: {cold['compile_s']:.1f} s, and {cold['trace_s']:.1f} s of tracing")
     say(f"structure change, edit and pack: {change['median_us'] / 1e3:.2f} ms")
     say(
@@ -35,8 +39,10 @@ def show(result):
 
 def _ratios(result):
     table = Table(title="How many times faster, robot paper37", **LOOK)
-    for column, side in (("what", "left"), ("against", "left"), ("us", "right"), ("us", "right"), ("ratio", "right")):
-        table.add_column(column, justify=side)
+    for column in ("what", "against"):
+        table.add_column(column)
+    for column in ("us", "us", "ratio"):
+        table.add_column(column, justify="right", no_wrap=True)
     for row in result["ratios"]:
         slow, fast = (result["time"]["paper37"][row[key]]["median_us"] for key in ("slow", "fast"))
         table.add_row(row["what"], row["slow"], f"{slow:.2f}", f"{fast:.2f}", Text(f"{row['ratio']:.2f}", "bold"))
@@ -44,20 +50,19 @@ def _ratios(result):
 
 
 def _times(result):
-    table = Table(
-        title="Time per sample, us: median (10 to 90 %)", box=None, title_justify="left", padding=(0, 2, 0, 0)
-    )
-    names = list(result["time"])
-    table.add_column("forward dynamics")
-    for name in names:
-        table.add_column(name, justify="right")
-    for key in result["time"]["iiwa_free"]:
-        cells = []
-        for name in names:
-            x = result["time"][name].get(key)
-            cells.append(f"{x['median_us']:.2f} ({x['p10_us']:.2f} to {x['p90_us']:.2f})" if x else "")
-        table.add_row(key, *cells)
+    table = Table(title="Forward dynamics, time per sample, us: median (10 to 90 %)", **LOOK)
+    table.add_column("")
+    for name in result["time"]:
+        table.add_column(name, justify="right", no_wrap=True)
+    cell = lambda x: f"{x['median_us']:.3g} ({x['p10_us']:.3g}-{x['p90_us']:.3g})"
+    for key in _forward(result):
+        table.add_row(key, *(cell(times[key]) for times in result["time"].values()))
     return table
+
+
+def _forward(result):
+    """The contenders that compute accelerations."""
+    return [key for key in result["time"]["iiwa_free"] if "Derivatives" not in key]
 
 
 def chart(result, path):
@@ -67,7 +72,7 @@ def chart(result, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    keys = [key for key in result["time"]["iiwa_free"] if "width" not in key or key.endswith("width 1")]
+    keys = _forward(result)
     figure, panels = plt.subplots(1, len(result["time"]), figsize=(12, 0.4 * len(keys) + 1.4), sharey=True)
     for axes, (name, times) in zip(panels, result["time"].items(), strict=True):
         medians = [times[key]["median_us"] for key in keys]
