@@ -3,7 +3,8 @@
     python benchmarks/cores.py
 
 Two lines do it (see `spread`); the library does nothing by hand. Also counts the collectives of the program: none, so
-no core waits for another.
+no core waits for another. XLA's threads are as by default here, with one device too: flags that ask for one thread make
+the devices take turns.
 """
 
 import os
@@ -24,9 +25,9 @@ def spread(f, mesh, states):
 
 def main():
     """Measure, save, show."""
-    os.environ |= harness.ONE_THREAD  # of each device
     import jax
 
+    jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", os.cpu_count())
     import contenders
     import peers

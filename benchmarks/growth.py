@@ -178,7 +178,7 @@ def chart(result, path):
     block.legend()
     for name, widths in result["shape"]["batch 1"].items():
         shape.plot(list(widths), [x["median_us"] for x in widths.values()], "o-", label=name)
-    shape.set(xlabel="width of a step, one sample, 32 joints", ylabel="us a sample")
+    shape.set(xlabel="width of a step, one sample, 32 joints", ylabel="us a sample", yscale="log")
     shape.legend()
     figure.suptitle(f"Forward dynamics, one thread, {result['cpu']}")
     figure.tight_layout()
