@@ -6,7 +6,9 @@ RK4 keeps its order: θ' = w + 1/2 θ x w + 1/12 θ x (θ x w). Without the last
 Source: Munthe-Kaas, High order Runge-Kutta methods on manifolds (1999).
 """
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from sdyn.chain import Chain
@@ -71,18 +73,17 @@ def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_
 
 
 def _rk4(chain, q0, v0, acceleration, t0, dt):
-    def slope(t, xi, v):
+    """The four stages in a scan, so that one of them is compiled."""
+
+    def stage(carry, x):
+        """The slope at the fraction c of the step, reached along the slope before, and the weighted sum so far."""
+        ((k, total), (c, weight)) = carry, x
+        xi, v = c * dt * k[0], v0 + c * dt * k[1]
         q = retract(chain, q0, xi)
-        return increment_rate(chain, q, xi, v), acceleration(t0 + t, q, v)
+        k = increment_rate(chain, q, xi, v), acceleration(t0 + c * dt, q, v)
+        return (k, jax.tree.map(lambda s, x: s + weight * x, total, k)), None
 
-    def stage(x, c):
-        """The slope at the fraction c of the step, reached along the slope x."""
-        return slope(c * dt, c * dt * x[0], v0 + c * dt * x[1])
-
-    rest = (jnp.zeros_like(v0), jnp.zeros_like(v0))
-    k1 = stage(rest, 0.0)
-    k2 = stage(k1, 0.5)
-    k3 = stage(k2, 0.5)
-    k4 = stage(k3, 1.0)
-    xi, dv = ((k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) / 6 for i in range(2))
+    rest = jnp.zeros_like(v0), jnp.zeros_like(v0)
+    fractions, weights = jnp.array([0, 1 / 2, 1 / 2, 1], v0.dtype), jnp.array([1 / 6, 1 / 3, 1 / 3, 1 / 6], v0.dtype)
+    (_, (xi, dv)), _ = lax.scan(stage, (rest, rest), (fractions, weights))
     return retract(chain, q0, dt * xi), v0 + dt * dv
