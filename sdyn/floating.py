@@ -10,6 +10,9 @@ With M = [[M_bb, M_bj], [M_jb, M_jj]], the total momentum h about the base's ori
 The base block is a rigid body's, [[I − m ĉ ĉ, m ĉ], [−m ĉ, m]] with ĉ x = c x x, so it is solved about the centre of
 mass c: one 3x3 inverse. For a grounded base all of it is zero, and the joints stand alone.
 
+A closure between two links has no columns for the base (K_b = 0), so closed chains add K_jᵀ lam to τ and K_j q̈ = k to
+the joints' equations and leave the rest as it is. A closure to ground exchanges momentum, like a grounded base.
+
 Source: Umetani and Yoshida, Resolved motion rate control of space manipulators (1989); Nenchev, Umetani and Yoshida,
 Analysis of a redundant free-flying spacecraft/manipulator system (1992).
 """
@@ -21,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sdyn.chain import Chain, JointRow
+from sdyn.closures import loop_jacobian, loop_residual
 from sdyn.constraints import forward_dynamics
 from sdyn.coordinates import pose_of
 from sdyn.dynamics import inverse_dynamics, mass_matrix
@@ -100,7 +104,8 @@ def floating_inverse_dynamics(
         gravity, f_ext: As for `inverse_dynamics`.
 
     Returns:
-        tau, vdot: `tau` starts with the wrench. `forward_dynamics` of the first is the second.
+        tau, vdot: `tau` starts with the wrench. `forward_dynamics` of the first is the second. In a closed chain the
+        closures carry nothing under tau; `constrained_inverse_dynamics` of vdot has the smallest forces.
     """
     q, v, accelerations, wrench = expect(chain, q=q, v=v, accelerations=accelerations, wrench=wrench)
     wrench = jnp.zeros(6, q.dtype) if wrench is None else wrench
@@ -130,7 +135,7 @@ def reduced_dynamics(
         gravity, f_ext: As for `forward_dynamics`.
 
     Returns:
-        M*, symmetric and positive on the joints that move; b*.
+        M*, symmetric and positive on the joints that move; b*. Both of the tree; closures add their K^T lam to tau.
     """
     v = floating_velocity(chain, q, rates, momentum)
     M, nb = mass_matrix(chain, q), chain.capacity.base_nv
@@ -163,17 +168,18 @@ def generalised_jacobian(chain: Chain, q: Float[Array, " nq"], frame) -> Float[A
 def reaction_null_space(
     chain: Chain, q: Float[Array, " nq"], *, rtol: float | None = None
 ) -> tuple[Float[Array, "joints joints"], Int[Array, ""]]:
-    """Projector onto the joint rates that leave the free base at rest, at zero momentum.
+    """Projector onto the joint rates that leave the free base at rest, at zero momentum, and the loops closed.
 
     Args:
-        chain: Packed structure; every rate leaves a grounded base at rest.
+        chain: Packed structure; every rate that its loops allow leaves a grounded base at rest.
         q: Configuration.
-        rtol: Reactions below this part of the trace of the robot's own inertia count as none; 1000 eps by default.
+        rtol: What counts as no reaction and as no motion in a closure, as a part of the trace of the robot's own
+            inertia and of its radius of gyration; by default 1000 eps, or ten times what the loops are open by.
 
     Returns:
         N, rank: N is symmetric, N N = N, zero where empty, orthogonal in joint rates (so it depends on units where
-        joints that turn and joints that slide are mixed); rank is that of the reaction M_bj, at most 6. Differentiable
-        where the rank does not change; where it does, N jumps.
+        joints that turn and joints that slide are mixed); rank is that of the reaction M_bj and of the closures
+        together. Differentiable where the rank does not change; where it does, N jumps.
     """
     (q,) = expect(chain, q=q)
     base, moves = _base(chain, mass_matrix(chain, q)), _moves(chain)
@@ -182,7 +188,12 @@ def reaction_null_space(
     A = jnp.concatenate([turn / size, push / jnp.sqrt(size * base.mass)])
     if A.size == 0:
         return jnp.zeros((0, 0), A.dtype), jnp.array(0)
-    N, rank = _null_projector(A, 1000 * jnp.finfo(A.dtype).eps if rtol is None else rtol)
+    tol = 1000 * jnp.finfo(A.dtype).eps
+    if chain.capacity.rows:
+        K, length = loop_jacobian(chain, q)[:, chain.capacity.base_nv :], jnp.sqrt(size / base.mass)
+        A = jnp.concatenate([A, K / jnp.maximum(1, length)])
+        tol = jnp.maximum(tol, 10 * jnp.abs(loop_residual(chain, q)).max())
+    N, rank = _null_projector(A, tol if rtol is None else rtol)
     return N * moves * moves[:, None], rank
 
 

@@ -7,7 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from functions import FD, ID, MASS, MOTION, TOTALS
-from structures import QUICKLY, ROBOTS, STATES, TABLE, close, on_states, packed, q_rate, real, robot, state, states
+from structures import (
+    QUICKLY,
+    ROBOTS,
+    STATES,
+    TABLE,
+    close,
+    on_states,
+    packed,
+    q_rate,
+    real,
+    robot,
+    state,
+    states,
+    tree,
+)
 from test_gradients import differences
 
 import sdyn
@@ -199,6 +213,43 @@ def test_exact_layout(name):
     want = v[at], vdot[at], tau[at], other[at], M[at[6:]][:, at[6:]], b[at[6:]], N[at[6:]][:, at[6:]], rank
     for a, b in zip(exact(chain, x.q[0], x.v[0], x.tau[0], x.vdot[0], momentum), want, strict=True):
         close(a, b, 2e-14)  # 1.7e-15
+
+
+# -- closed chains -----------------------------------------------------------------------------------------------------
+
+
+def test_closed_chain(rng):
+    """Two arms on one target, free: motion, forces, null space and reduced equations hold the loop, by its rows."""
+    frames = [sdyn.Frame(f"e{k}", "l7", position=p) for k, p in enumerate(rng.uniform(-0.2, 0.2, (2, 3)))]
+    robot = tree((0, 1, 2, 3, 4, 5, 6, 0, 8, 9, 10, 11, 12, 13), seed=7)
+    q = robot.neutral()
+    q[7:] = rng.normal(size=14)
+    closed = robot.close("e0", frames[1], q=q)
+    chain, joints = sdyn.pack(closed), slice(6, None)
+    K = np.asarray(sdyn.loop_jacobian(chain, q))
+    assert np.abs(K[:, :6]).max() < 1e-14
+    rates = rng.normal(size=14)
+    rates -= np.linalg.pinv(K[:, joints]) @ K[:, joints] @ rates
+    tau, momentum = rng.normal(size=14), rng.normal(size=6)
+
+    @partial(jax.jit, **QUICKLY)
+    def everything(chain, q, rates, tau, momentum):
+        v, vdot = sdyn.floating_forward_dynamics(chain, q, rates, tau, momentum)
+        force, again = sdyn.floating_inverse_dynamics(chain, q, v, vdot[joints])
+        back = sdyn.floating_forward_dynamics(chain, q, rates, force[joints], momentum)[1]
+        M, b = sdyn.reduced_dynamics(chain, q, rates, momentum)
+        return v, vdot, again, back, M, b, *sdyn.reaction_null_space(chain, q), sdyn.mass_matrix(chain, q)
+
+    v, vdot, again, back, M, b, N, rank, mass = map(np.asarray, everything(chain, q, rates, tau, momentum))
+    close(sdyn.momentum(chain, q, v), momentum, 1e-13)
+    close(again, vdot, 1e-11)
+    close(back, vdot, 1e-11)
+    lam = np.linalg.lstsq(K[:, joints].T, M @ vdot[joints] + b - tau)[0]
+    close(M @ vdot[joints] + b, tau + K[:, joints].T @ lam, 1e-11, scale=b)
+    assert rank == 12
+    close(np.trace(N), 2.0, 1e-12)
+    close(mass[:6, joints] @ N, np.zeros((6, 14)), 1e-13, scale=mass)
+    close(K[:, joints] @ N, np.zeros((6, 14)), 1e-13, scale=K)
 
 
 # -- wheels and thrusters ----------------------------------------------------------------------------------------------
