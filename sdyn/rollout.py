@@ -113,7 +113,7 @@ def hybrid_rollout(
     if not callable(taus) and len(jnp.asarray(taus)) != count:
         raise ValueError(f"hybrid_rollout: taus has {len(taus)} phases and there are {count} durations.")
     starts = jnp.cumsum(durations) - durations
-    times = starts[:, None] + durations[:, None] * (jnp.arange(steps + 1) / steps)
+    times = starts[:, None] + durations[:, None] * jnp.arange(steps + 1) / steps
     none = jnp.zeros((first.capacity.links + first.capacity.loops, 6), q.dtype)
 
     def phase(state, x):
