@@ -18,7 +18,8 @@ from sdyn.pack import capacity, family, pack, pad, unpad
 from sdyn.kinematics import body_poses, frame_acceleration, frame_jacobian, frame_pose, frame_velocity
 from sdyn.dynamics import bias_force, inverse_dynamics, mass_matrix, solve_mass
 from sdyn.closures import loop_jacobian, loop_residual, loop_wrenches
-from sdyn.constraints import Status, constrained_dynamics, forward_dynamics
+from sdyn.constraints import Status, constrained_dynamics, constrained_inverse_dynamics, forward_dynamics
+from sdyn.partition import Partition, partition
 from sdyn.drift import project
 from sdyn.momentum import centre_of_mass, kinetic_energy, momentum
 from sdyn.floating import (

@@ -1,6 +1,7 @@
 """Dynamics of closed chains: M v̇ + b = τ + Kᵀ lam, with K v̇ = k.
 
-The multipliers come from the Delassus matrix, see `delassus.py`. Nothing is differentiated by AD: where
+Two solvers share no step: the Delassus matrix, see `delassus.py`, and the paper's coordinate partition, see
+`partition.py`. Neither is differentiated by AD: where
 r = [ID(q, v, v̇) − Kᵀ lam − τ; K v̇ − k] is zero,
     [M −Kᵀ; K 0] [dv̇; dlam] = −dr  along every change of state, parameters or closures,
 with dr from inverse dynamics under the closures' wrenches and from one sweep of accelerations. It holds for redundant
@@ -15,11 +16,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sdyn.chain import Chain, ClosureRow
-from sdyn.closures import closure_acceleration, loop_residual, loop_wrenches
-from sdyn.delassus import delassus, solve
+from sdyn.closures import closure_acceleration, loop_jacobian, loop_residual, loop_wrenches
+from sdyn.delassus import delassus
+from sdyn.delassus import solve as delassus_solve
 from sdyn.dynamics import inverse_dynamics, tree_dynamics
 from sdyn.inputs import expect
-from sdyn.semidefinite import spectrum
+from sdyn.partition import Partition, condition, partition
+from sdyn.partition import solve as partition_solve
+from sdyn.semidefinite import shortest, spectrum
 
 
 @jax.tree_util.register_dataclass
@@ -43,6 +47,8 @@ class Status:
     singular: Bool[Array, ""]
     """Whether sigma_min is below a thousand times the drift or the rounding: the accelerations may be wrong by the
     ratio of the two."""
+    partition: Float[Array, ""]
+    """Condition number of the dependent block of the partition; past 1e6, pick it anew. 1 for the other method."""
 
 
 def forward_dynamics(
@@ -78,7 +84,7 @@ def forward_dynamics(
     if chain.capacity.rows == 0:
         return tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    return _held(chain, q, v, tau, gravity, f_ext, baumgarte)[0]
+    return _held(chain, q, v, tau, gravity, f_ext, baumgarte, None)[0]
 
 
 def constrained_dynamics(
@@ -91,12 +97,15 @@ def constrained_dynamics(
     f_ext: Float[Array, "n 6"] | None = None,
     baumgarte=None,
     method: str = "proximal",
+    pairs: Partition | None = None,
 ) -> tuple[Float[Array, " nv"], Float[Array, " nc"], Status]:
     """Accelerations of a closed chain, and the wrenches in its closures.
 
     Args:
         chain, q, v, tau, gravity, f_ext, baumgarte: As for `forward_dynamics`; a consistent state comes from `project`.
-        method: "proximal", on the Delassus matrix.
+        method: "proximal", on the Delassus matrix, or "partition", the paper's equation (5).
+        pairs: What `partition` picked, for the second method; picked at q if left out, which costs more and may jump
+            from one q to the next.
 
     Returns:
         vdot: As of `forward_dynamics`.
@@ -107,16 +116,72 @@ def constrained_dynamics(
     Source:
         formulas.md, "Loops".
     """
-    if method != "proximal":
-        raise ValueError(f"constrained_dynamics: there is no method {method!r}; the method is 'proximal'.")
+    if method not in ("proximal", "partition"):
+        raise ValueError(f"constrained_dynamics: there is no method {method!r}; they are 'proximal' and 'partition'.")
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    vdot, lam = _held(chain, q, v, tau, gravity, f_ext, baumgarte)
-    return vdot, lam, _status(*jax.lax.stop_gradient((chain, q, v, vdot)))
+    if method == "partition" and pairs is None:
+        pairs = partition(*jax.lax.stop_gradient((chain, q)))
+    pairs = pairs if method == "partition" else None
+    vdot, lam = _held(chain, q, v, tau, gravity, f_ext, baumgarte, pairs)
+    return vdot, lam, _status(*jax.lax.stop_gradient((chain, q, v, vdot)), pairs)
+
+
+def constrained_inverse_dynamics(
+    chain: Chain,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    vdot: Float[Array, " nv"],
+    *,
+    actuated: Float[Array, " nv"] | None = None,
+    weight: Float[Array, " nv"] | None = None,
+    gravity: Float[Array, "3"] | None = None,
+    f_ext: Float[Array, "n 6"] | None = None,
+) -> tuple[Float[Array, " nv"], Float[Array, " nc"]]:
+    """Forces for a motion of a closed chain, the smallest ones where the actuation is redundant.
+
+    Args:
+        chain, q, v, vdot, gravity, f_ext: As for `inverse_dynamics`; the motion keeps the loops closed.
+        actuated: 1 for the entries of tau that a motor drives, 0 for those that must be zero; by default all joints,
+            and not a free base.
+        weight: Of the squares of the driven entries in the sum that tau makes least; ones by default, in N m and N.
+            For a base that thrusters drive as well, say so in `actuated`.
+
+    Returns:
+        tau: With tau + K^T lam = `inverse_dynamics`. What the closures cannot take from the entries that are not driven
+            is left in tau: a motion that needs it is not possible with these motors.
+        lam: The multipliers that come with tau, the internal loads; the shortest, where tau does not decide.
+    """
+    q, v, vdot, gravity, f_ext = expect(chain, q=q, v=v, vdot=vdot, gravity=gravity, f_ext=f_ext)
+    size = chain.capacity
+    force = inverse_dynamics(chain, q, v, vdot, gravity=gravity, f_ext=f_ext)
+    driven = (jnp.arange(chain.nv) >= size.base_nv) if actuated is None else jnp.asarray(actuated)
+    driven = driven.astype(q.dtype)
+    K, weight = loop_jacobian(chain, q), driven if weight is None else driven * weight
+    tolerance = jnp.full(size.rows, 64 * (chain.nv + size.rows) * jnp.finfo(q.dtype).eps)
+
+    def least(A, b):
+        """x of A x = b in the sense of least squares, the shortest; and what takes away all that A sees."""
+        G = A.T @ A
+        dead = (jnp.diagonal(G) <= (64 * jnp.finfo(q.dtype).eps) ** 2 * jnp.trace(K @ K.T)).astype(q.dtype)
+        inverse = lambda b: shortest(G, dead, tolerance, b)
+        return inverse(A.T @ b), lambda z: z - inverse(G @ z)
+
+    passive = K.T * (1 - driven)[:, None]
+    lam, unseen = least(passive, force * (1 - driven))
+    root = jnp.sqrt(weight)[:, None]
+    rest = jax.vmap(unseen, 1, 1)(jnp.eye(size.rows, dtype=q.dtype))
+    more, _ = least(root * (K.T @ rest), root[:, 0] * (force - K.T @ lam))
+    lam = lam + rest @ more
+    return force - K.T @ lam, lam
 
 
 @partial(jax.custom_jvp)
-def _held(chain, q, v, tau, gravity, f_ext, baumgarte):
+def _held(chain, q, v, tau, gravity, f_ext, baumgarte, pairs):
     """vdot and lam."""
+    if pairs is not None:
+        rest = jnp.zeros_like(v)
+        c = tau - inverse_dynamics(chain, q, v, rest, gravity=gravity, f_ext=f_ext)
+        return partition_solve(chain, q, pairs, c, -_opening(chain, q, v, rest, baumgarte))
     free = tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
     system = delassus(chain, q)
     lam = system.multipliers(-_opening(chain, q, v, free, baumgarte))
@@ -125,10 +190,12 @@ def _held(chain, q, v, tau, gravity, f_ext, baumgarte):
 
 @partial(_held.defjvp, symbolic_zeros=True)
 def _held_tangent(primals, tangents):
-    chain, q = primals[:2]
+    (chain, q), pairs = primals[:2], primals[-1]
     vdot, lam = _held(*primals)
-    c, d = _slope(lambda *x: _residual(*x, vdot, lam), primals, tangents)
-    return (vdot, lam), solve(chain, q, -c, -d)
+    c, d = _slope(lambda *x: _residual(*x, vdot, lam), primals[:-1], tangents[:-1])
+    if pairs is None:
+        return (vdot, lam), delassus_solve(chain, q, -c, -d)
+    return (vdot, lam), partition_solve(chain, q, pairs, -c, -d)
 
 
 def _opening(chain, q, v, vdot, rate):
@@ -160,7 +227,7 @@ def _slope(function, primals, tangents):
     return jax.jvp(f, tuple(leaves[i] for i in at), tuple(along[i] for i in at))[1]
 
 
-def _status(chain, q, v, vdot) -> Status:
+def _status(chain, q, v, vdot, pairs) -> Status:
     system = delassus(chain, q)
     count, eigenvalues = spectrum(system.G, system.dead, system.tolerance)
     sigma = jnp.sqrt(jnp.maximum(eigenvalues[::-1], 0))
@@ -176,4 +243,5 @@ def _status(chain, q, v, vdot) -> Status:
         drift=drift,
         error=jnp.abs(closure_acceleration(chain, q, v, vdot)).max(initial=0.0),
         singular=least < 1e3 * noise,
+        partition=jnp.ones_like(least) if pairs is None else condition(chain, q, pairs),
     )

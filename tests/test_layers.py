@@ -26,7 +26,7 @@ DEVICE = [
     ["pack", "sweep", "inputs", "coordinates"],
     ["rnea", "crba", "aba"],
     ["kinematics"],
-    ["dynamics", "closures", "delassus", "constraints", "drift"],
+    ["dynamics", "closures", "delassus", "partition", "constraints", "drift"],
     ["momentum", "params", "floating", "actuators"],
     ["transition", "integrate"],
     ["rollout"],

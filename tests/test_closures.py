@@ -1,0 +1,244 @@
+"""Laws of closures: each kind against the joint of that kind, both solvers, redundancy, derivatives, compilations."""
+
+import json
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+from mechanisms import four_bar, row_of_four_bars
+from structures import QUICKLY, UNBALANCED, body, close, rotation, tree, unit
+from test_gradients import differences
+
+import sdyn
+from sdyn.posture import link_poses
+
+GRAVITY = np.array([0.4, -0.7, -9.81])
+KINDS = ("weld", "revolute", "prismatic", "universal", "spherical", "cylindrical", "planar")
+
+
+# -- each kind of closure is the joint of that kind --------------------------------------------------------------------
+
+
+def tree_and_loop(kind, rng):
+    """Two arms on a free base, the second one joined to the first by a joint; and by three slides, a ball and a
+    closure."""
+    links = [body(rng, name) for name in ("base", "one", "two", "tool")]
+    place = lambda: (rotation(rng), rng.uniform(-0.4, 0.4, 3))
+    arm = [sdyn.Joint(f"arm{k}", "revolute", *ends, *place(), unit(rng)) for k, ends in enumerate(
+        (("base", "one"), ("one", "two")))]  # fmt: skip
+    at = place()
+    frames = [sdyn.Frame("grip", "tool", position=rng.uniform(-0.2, 0.2, 3)), sdyn.Frame("hand", "two", *at)]
+    joined = sdyn.Robot(
+        links, [*arm, sdyn.Joint("tie", "fixed" if kind == "weld" else kind, "two", "tool", *at)], frames
+    )
+    carts = [sdyn.Link(f"cart{k}", 0.0) for k in range(3)]
+    chain = ["base", "cart0", "cart1", "cart2", "tool"]
+    rails = [sdyn.Joint(f"rail{k}", "prismatic", *chain[k : k + 2], axis=np.eye(3)[k]) for k in range(3)]
+    ball = sdyn.Joint("ball", "spherical", "cart2", "tool")
+    loose = sdyn.Robot([*links, *carts], [*arm, *rails, ball], frames)
+    return joined, loose.close("hand", sdyn.Frame("tool", "tool"), kind, name="tie")
+
+
+def quaternion(R):
+    w = np.sqrt(max(1 + np.trace(R), 1e-300)) / 2
+    return np.r_[w, np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)]
+
+
+@partial(jax.jit, **QUICKLY)
+def motion(chain, q, v, tau):
+    """Accelerations of two frames by both solvers, the free ones, and what belongs to the closure."""
+    J = jnp.concatenate([sdyn.frame_jacobian(chain, q, name) for name in ("grip", "hand")])
+    found = [sdyn.constrained_dynamics(chain, q, v, tau, gravity=GRAVITY, method=m) for m in ("proximal", "partition")]
+    frames = lambda vdot: jnp.concatenate([sdyn.frame_acceleration(chain, q, v, vdot, x) for x in ("grip", "hand")])
+    return J, [frames(x[0]) for x in found], found, sdyn.loop_residual(chain, q)
+
+
+@partial(jax.jit, **QUICKLY)
+def free_motion(chain, q, v, tau):
+    vdot = sdyn.forward_dynamics(chain, q, v, tau, gravity=GRAVITY)
+    J = jnp.concatenate([sdyn.frame_jacobian(chain, q, name) for name in ("grip", "hand")])
+    return J, jnp.concatenate([sdyn.frame_acceleration(chain, q, v, vdot, name) for name in ("grip", "hand")])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_closure_is_the_joint_of_its_kind(kind, rng):
+    """Accelerations of a tree with a joint, and of a tree of more coordinates with a closure in its place."""
+    joined, closed = tree_and_loop(kind, rng)
+    everything = [tree_and_loop(k, np.random.default_rng(0))[1] for k in KINDS]
+    both = sdyn.capacity([joined, *(tree_and_loop(k, np.random.default_rng(0))[0] for k in KINDS)])
+    one, two = sdyn.pack(joined, both), sdyn.pack(closed, sdyn.capacity([closed, *everything]))
+    q = 0.7 * rng.normal(size=joined.nq)
+    q[3:7] = unit(rng, 4)
+    if kind == "spherical":
+        q[-4:] = unit(rng, 4)
+    v, tau = rng.normal(size=joined.nv), rng.normal(size=8)
+    R, p = link_poses(joined, q)
+    R, p = R[0].T @ R[3], R[0].T @ (p[3] - p[0])
+    q2 = np.r_[q[:9], p, quaternion(R)]
+    (qa, va), (qb, _) = sdyn.pad(one, q, v), sdyn.pad(two, q2, np.zeros(14))
+    ta, tb = sdyn.pad(one, q, np.r_[tau, np.zeros(joined.nv - 8)])[1], sdyn.pad(two, q2, np.r_[tau, np.zeros(6)])[1]
+    J, want = free_motion(one, qa, va, ta)
+    Jb = np.asarray(motion(two, qb, jnp.zeros(two.nv), tb)[0])
+    vb = np.zeros(two.nv)
+    vb[:14] = np.linalg.lstsq(np.r_[Jb, np.eye(8, two.nv)][:, :14], np.r_[J @ va, v[:8]])[0]
+    _, accelerations, found, residual = motion(two, qb, vb, tb)
+    close(residual, 0 * residual, 1e-14, scale=1.0)
+    for got, (_, _, status) in zip(accelerations, found, strict=True):
+        close(got, want, 1e-12)
+        assert status.rank == two.row_index[2].sum() and not status.redundant
+        assert float(status.error) < 1e-11 and not status.singular
+    close(found[0][1], found[1][1], 1e-12, scale=1.0)  # the multipliers of the two solvers
+
+
+# -- redundancy and derivatives ----------------------------------------------------------------------------------------
+
+
+def doubled():
+    """A four-bar in space, with a revolute closure, stated twice: ten rows, two of them independent."""
+    once = four_bar()
+    loop = once.loops[0]
+    return once, once.close(loop.frame_a, loop.frame_b, loop.kind, name="again")
+
+
+def state():
+    data = json.loads((oracles.DATA / "fourbar_states.json").read_text())["states"][4]
+    return [np.array([float(x) for x in data[key]]) for key in ("q", "qd", "tau")]
+
+
+def both(chain, q, v, tau, mass):
+    chain = sdyn.with_params(chain, replace(sdyn.params(chain), mass=mass))
+    vdot, lam, status = sdyn.constrained_dynamics(chain, q, v, tau, gravity=GRAVITY)
+    return jnp.concatenate([vdot, lam]), status
+
+
+@partial(jax.jit, **QUICKLY)
+def derivatives(chain, w, x, along):
+    f = lambda *x: both(chain, *x)[0]
+    scalar = lambda *x: w @ f(*x)
+    y, slope = jax.jvp(f, x, along)
+    g, turned = jax.jvp(jax.grad(scalar, (0, 1, 2, 3)), x, along)
+    return y, slope, g, turned
+
+
+BOTH = jax.jit(both, **QUICKLY)
+
+
+def test_closure_stated_twice(rng):
+    """The same accelerations and half the multiplier each; so are their first and second derivatives."""
+    once, twice = doubled()
+    w, x, out = rng.normal(size=3), state(), []
+    along = [rng.normal(size=3) for _ in range(3)]
+    for chain in map(sdyn.pack, (once, twice)):
+        mass = np.asarray(chain.link_mass)
+        full = (*x, mass), (*along, mass * rng.uniform(size=4) if not out else out[0][1][3])
+        weights = np.r_[w, np.zeros(chain.capacity.rows)]
+        weights[3:8] = [0.3, -0.2, 0.0, 0.7, -0.9]
+        out.append((full[0], full[1], weights, chain, derivatives(chain, weights, *full), BOTH(chain, *full[0])[1]))
+    (y1, s1, *_), (y2, s2, *_) = out[0][4], out[1][4]
+    assert [int(x[5].rank) for x in out] == [2, 2] and all(x[5].redundant for x in out)
+    close(y2[:3], y1[:3], 1e-13)
+    close(s2[:3], s1[:3], 1e-13)
+    for a, b in ((y1, y2), (s1, s2)):
+        close(b[3:8], a[3:] / 2, 1e-13)
+        close(b[8:], a[3:] / 2, 1e-13)
+    for full, along, w, chain, (_, slope, g, turned), _ in out:
+        value = lambda *x, chain=chain: BOTH(chain, *x)[0]
+        close(slope, differences(lambda x, value=value: value(*x), full, along, 1e-4), 1e-9)
+        close(sum((a * b).sum() for a, b in zip(g, along, strict=True)), w @ slope, 1e-12)
+        gradients = lambda x, chain=chain, w=w, along=along: np.concatenate(derivatives(chain, w, x, along)[2])
+        close(np.concatenate(turned), differences(gradients, full, along, 1e-4), 1e-8)
+
+
+def test_torques_of_a_closed_chain(rng):
+    """Their motion is the wanted one; those of one motor are the only ones; those of three are the smallest."""
+    once, twice = doubled()
+    q, v, _ = state()
+    for chain in map(sdyn.pack, (once, twice)):
+        vdot, _, _ = sdyn.constrained_dynamics(chain, q, v, rng.normal(size=3), gravity=GRAVITY)
+        K = np.asarray(sdyn.loop_jacobian(chain, q))
+        for actuated in ([1, 1, 1], [1, 0, 0], [0, 1, 1]):
+            at = np.array(actuated, float)
+            tau, lam = sdyn.constrained_inverse_dynamics(chain, q, v, vdot, actuated=at, gravity=GRAVITY)
+            close(tau * (1 - at), 0 * tau, 1e-12, scale=tau)
+            close(sdyn.forward_dynamics(chain, q, v, tau, gravity=GRAVITY), vdot, 1e-12)
+            close(tau + K.T @ lam, sdyn.inverse_dynamics(chain, q, v, vdot, gravity=GRAVITY), 1e-12)
+            # moving along what the closures and the motors allow does not make the sum of squares smaller
+            basis = np.linalg.svd(np.where(at == 0, K, 0))[0]
+            free = K.T @ basis[:, np.linalg.matrix_rank(np.where(at == 0, K, 0)) :]
+            close(free.T @ tau, 0 * (free.T @ tau), 1e-11, scale=1.0)
+
+
+# -- data, not programs ------------------------------------------------------------------------------------------------
+
+
+def test_closing_compiles_nothing():
+    """Opening, closing, another kind, a lock, another base, ground, and other names are one program."""
+    open_tree = tree(UNBALANCED)
+    at = open_tree.neutral()
+    ends = sdyn.Frame("x", "l3"), sdyn.Frame("y", "l8")
+    closed = open_tree.close(*ends, "weld", name="one", q=at)
+    variants = [
+        closed.close("e0", "ground", "point", name="two", q=at),
+        open_tree,
+        closed,
+        open_tree.close(*ends, "universal", name="one", q=at),
+        closed.lock({"j1": 0.0}),
+        closed.reroot("l8"),
+        closed.ground("l0"),
+        open_tree.close("ground", "e0", name="two", q=at),
+    ]
+    size, other = sdyn.capacity(variants), sdyn.capacity([x.prefixed("other_") for x in variants])
+    fd = jax.jit(partial(sdyn.forward_dynamics), **QUICKLY)
+    for k, mine in enumerate(variants + [x.prefixed("other_") for x in variants]):
+        chain = sdyn.pack(mine, size if k < 8 else other)
+        q, v = sdyn.pad(chain, mine.neutral(), np.zeros(mine.nv))
+        vdot = fd(chain, q, v, jnp.ones_like(v))
+        K = sdyn.loop_jacobian(chain, q)
+        close(K @ vdot, 0 * (K @ vdot), 1e-12, scale=vdot)
+        close(sdyn.loop_residual(chain, q), np.zeros(size.rows), 1e-14, scale=1.0)
+    assert fd._cache_size() == 1
+    assert sdyn.capacity([open_tree]).rows == 0
+    zeros = [np.zeros(n) for n in (open_tree.nq, open_tree.nv, open_tree.nv)]
+    text = str(jax.make_jaxpr(sdyn.forward_dynamics)(sdyn.pack(open_tree), *zeros))
+    assert "aba" in text and "semidefinite" not in text and "_held" not in text
+
+
+# -- consistent states, drift ------------------------------------------------------------------------------------------
+
+
+def test_projection(rng):
+    """Closed, at rest where the closures hold, as near in kinetic energy as can be; and its slope."""
+    mine = row_of_four_bars(2)
+    chain = sdyn.pack(mine)
+    q = np.r_[np.full(3, 1.1), np.full(2, -1.1)] + 0.15 * rng.normal(size=5)
+    v = rng.normal(size=5)
+    run = jax.jit(lambda q, v: jnp.concatenate(sdyn.project(chain, q, v)), **QUICKLY)
+    q1, v1 = np.split(run(q, v), 2)
+    K, M = np.asarray(sdyn.loop_jacobian(chain, q1)), np.asarray(sdyn.mass_matrix(chain, q1))
+    close(sdyn.loop_residual(chain, q1), np.zeros(6), 1e-14, scale=1.0)
+    close(K @ v1, np.zeros(6), 1e-13, scale=1.0)
+    free = np.linalg.svd(K)[2][np.linalg.matrix_rank(K) :]
+    close(free @ M @ (v1 - v), np.zeros(len(free)), 1e-12, scale=1.0)
+    assert np.abs(q1 - q).max() < 0.5
+    along = rng.normal(size=5), rng.normal(size=5)
+    slope = jax.jit(lambda *x: jax.jvp(run, *x)[1], **QUICKLY)((q, v), along)
+    close(slope, differences(lambda x: run(*x), (q, v), along, 1e-4), 1e-8)
+
+
+def test_drift():
+    """Projection leaves rounding, Baumgarte lets an error decay at its rate, and nothing keeps it."""
+    mine = four_bar("point")
+    chain, (q, _, _) = sdyn.pack(mine), state()
+    steps, rate = 100, 20.0
+    still = q + np.array([0.0, 1e-4, 0.0])
+    run = lambda drift: sdyn.rollout(chain, still, np.zeros(3), np.zeros((steps, 3)), 0.005, drift=drift)[0]
+    size = lambda q: np.abs(np.asarray(sdyn.loop_residual(chain, q))).max()
+    project, baumgarte, nothing = (jax.jit(partial(run, drift), **QUICKLY)() for drift in ("project", rate, 0.0))
+    assert size(project[1]) < 1e-14 and size(project[-1]) < 1e-14
+    t = 0.5
+    assert abs(size(baumgarte[-1]) / (size(still) * (1 + rate * t) * np.exp(-rate * t)) - 1) < 0.05
+    assert size(nothing[-1]) > 0.3 * size(still)
