@@ -55,21 +55,22 @@ def loop_jacobian(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "nc nv"]
         q: Configuration [m, rad, unit quaternion wxyz].
     """
     (q,) = expect(chain, q=q)
-    Ja, Jb, _ = closure_parts(chain, q)
-    return Ja - Jb
+    return closure_parts(chain, q)[0]
 
 
 def closure_parts(chain: Chain, q):
-    """K in two parts, the rows of frame a's twist and of frame b's, and the residual."""
+    """K, the squared length of the twists that each row picks a component of, and the residual."""
     pose = pose_of(chain, q)
     slots, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
     ends = ends_of(chain, pose, *link_poses(chain, slots[..., 0]))
-    X = basis(chain, ends)
     slot = jnp.append(chain.link_index[LinkRow.SLOT], chain.capacity.slots + 1)  # the ground does not move
     columns = lambda end: jacobian_columns(chain, pose, S[..., 0], slot[chain.loop_index[end]])
-    rows = chain.row_index[ClosureRow.LOOP]
-    Ja, Jb = (jnp.einsum("rk,rkv->rv", X, columns(end)[rows]) for end in (LoopRow.A, LoopRow.B))
-    return Ja, Jb, residual_of(chain, ends)
+    D = columns(LoopRow.A) - columns(LoopRow.B)
+    K = jnp.einsum("rk,rkv->rv", basis(chain, ends), D[chain.row_index[ClosureRow.LOOP]])
+    linear = D[:, 3:] + jnp.cross(D[:, :3], ends.xa[:, :, None], axis=1)
+    turn, slide = ((x * x).sum((1, 2))[:, None] for x in (D[:, :3], linear))
+    size = _rows(chain, jnp.concatenate([turn, turn, turn, slide, slide, slide, turn], 1))
+    return K, size, residual_of(chain, ends)
 
 
 def closure_acceleration(chain: Chain, q, v, vdot):

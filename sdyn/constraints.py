@@ -36,8 +36,8 @@ class Status:
     redundant: Bool[Array, ""]
     """Whether rows depend on others: then lam is the shortest of many."""
     sigma_min: Float[Array, ""]
-    """Smallest singular value of the independent rows of K M^-1/2, rows scaled to length one: the sine of the
-    smallest angle between a row and the others, if there are two."""
+    """Smallest singular value of the independent rows of K M^-1/2. A row is scaled to the share that it has of the
+    twists of its frames, at most one: near zero, the closures let the motion through or say the same twice."""
     condition: Float[Array, ""]
     """Largest over smallest of these singular values."""
     drift: Float[Array, ""]
@@ -95,9 +95,9 @@ def constrained_dynamics(
     *,
     gravity: Float[Array, "3"] | None = None,
     f_ext: Float[Array, "n 6"] | None = None,
-    baumgarte=None,
     method: str = "proximal",
     pairs: Partition | None = None,
+    baumgarte=None,
 ) -> tuple[Float[Array, " nv"], Float[Array, " nc"], Status]:
     """Accelerations of a closed chain, and the wrenches in its closures.
 
@@ -229,7 +229,7 @@ def _slope(function, primals, tangents):
 
 def _status(chain, q, v, vdot, pairs) -> Status:
     system = delassus(chain, q)
-    count, eigenvalues = spectrum(system.G, system.dead, system.tolerance)
+    count, eigenvalues = spectrum(system.G, system.dead, system.tolerance, system.share)
     sigma = jnp.sqrt(jnp.maximum(eigenvalues[::-1], 0))
     least = jnp.where(count > 0, sigma[jnp.maximum(count - 1, 0)], 1.0)
     drift = jnp.abs(loop_residual(chain, q)).max(initial=0.0)

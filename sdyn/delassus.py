@@ -19,8 +19,10 @@ class Delassus(NamedTuple):
     Y: Float[Array, "nv nc"]
     """M⁻¹ Kᵀ."""
     G: Float[Array, "nc nc"]
+    share: Float[Array, " nc"]
+    """Length of each row of K, of that of the twists that it picks a component of."""
     dead: Float[Array, " nc"]
-    """1 where a row of K is zero but for rounding."""
+    """1 where a row is zero but for rounding."""
     tolerance: Float[Array, " nc"]
     """Pivot below which a row depends on others."""
 
@@ -31,10 +33,9 @@ class Delassus(NamedTuple):
 
 def delassus(chain: Chain, q) -> Delassus:
     """The Delassus matrix, and what is needed beside it."""
-    Ja, Jb, residual = closure_parts(chain, q)
-    K = Ja - Jb
+    K, size, residual = closure_parts(chain, q)
     Y = jax.vmap(lambda row: solve_mass(chain, q, row), out_axes=1)(K)
-    return Delassus(K, Y, K @ Y, *_judged(*jax.lax.stop_gradient((K, Ja, Jb, residual))))
+    return Delassus(K, Y, K @ Y, *_judged(*jax.lax.stop_gradient((K, size, residual))))
 
 
 def solve(chain: Chain, q, c, d):
@@ -45,18 +46,17 @@ def solve(chain: Chain, q, c, d):
     return x + system.Y @ y, y
 
 
-def _judged(K, Ja, Jb, residual):
-    """Which rows of K are zero but for rounding, and the squared sine below which a row depends on others.
+def _judged(K, size, residual):
+    """The share of each row, which are zero, and the squared sine below which a row depends on others.
 
-    A row is the difference of two, together of length `size`. It is off by their rounding, and by as much as the
-    closures are open: where rows are redundant on the closed chain, that makes them look independent.
+    A row is off by rounding, and by as much as the closures are open: where rows are redundant on the closed chain,
+    that makes them look independent.
     """
     n, eps = len(K), jnp.finfo(K.dtype).eps
-    size = jnp.sqrt((Ja * Ja + Jb * Jb).sum(1))
-    safe = jnp.where(size > 0, size, 1.0)
+    safe = jnp.sqrt(jnp.where(size > 0, size, 1.0))
     share = jnp.where(size > 0, jnp.sqrt((K * K).sum(1)) / safe, 0.0)
     drift = jnp.max(jnp.where(size > 0, jnp.abs(residual) / safe, 0.0), initial=0.0)
     off = jnp.maximum(64 * eps, jnp.minimum(10 * drift, 3e-5))
     dead = share <= off
     tolerance = jnp.maximum(64 * n * eps, (off / jnp.where(dead, 1.0, share)) ** 2)
-    return dead.astype(K.dtype), tolerance
+    return share, dead.astype(K.dtype), tolerance

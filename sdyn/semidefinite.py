@@ -128,8 +128,9 @@ def shortest(G, dead, tolerance, b):
     return solve(G[..., None], dead[:, None], tolerance[:, None], b[:, None, None])[0][:, 0, 0]
 
 
-def spectrum(G, dead, tolerance):
-    """Number of independent rows, and the eigenvalues of the scaled matrix, ascending, zero for dead rows [n]."""
+def spectrum(G, dead, tolerance, scale):
+    """Number of independent rows, and the eigenvalues of G with the diagonal scale², ascending; zero for dead rows."""
     (independent,) = rank(G[..., None], dead[:, None], tolerance[:, None])
     A, d = scaled(G[..., None], dead[:, None])
-    return independent.sum().astype(int), jnp.linalg.eigvalsh(A[..., 0] * (d[:, 0] > 0))
+    scale = jnp.where(d[:, 0] > 0, scale, 0.0)
+    return independent.sum().astype(int), jnp.linalg.eigvalsh(A[..., 0] * scale * scale[:, None])

@@ -1,6 +1,7 @@
 """Planar mechanisms of the literature as robots, and how far their states are from the reference data."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import oracles
@@ -88,3 +89,16 @@ def andrews() -> tuple[sdyn.Robot, dict]:
     for k, x, y in ((3, 0.0, -p["ss"]), (4, 0.0, -p["e"]), (6, p["zf"], 0.0)):
         robot = robot.close(tip("e2", "k2", -p["d"]), tip(f"e{k}", f"k{k}", x, y), "point", name=f"pin{k}")
     return robot, p
+
+
+def two_arms() -> sdyn.Robot:
+    """Two arms of seven joints on a free base; the first hand holds a target, which the second can hold too."""
+    arm = lambda side, y: with_frame(sdyn.models.load("deos7").prefixed(side), f"{side}mount", f"{side}base", (0, y, 0))
+    left, right, target = arm("l_", 0.0), arm("r_", 0.9), sdyn.models.load("sat50").prefixed("t_")
+    both = left.attach(right, "l_mount", "r_mount", name="bus")
+    target = with_frame(target, "handle", target.base, (0.2, -0.3, 0.1))
+    return both.attach(target, "l_hand", "t_grasp", name="held")
+
+
+def with_frame(robot, name, link, position):
+    return replace(robot, frames=(*robot.frames, sdyn.Frame(name, link, position=position)))

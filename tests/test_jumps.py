@@ -1,0 +1,206 @@
+"""Changes of structure with closures: momentum, energy, restitution, and gradients through a capture."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mechanisms
+import numpy as np
+import pytest
+from structures import QUICKLY, UNBALANCED, close, states, tree
+from test_gradients import differences
+
+import sdyn
+
+ENDS = sdyn.Frame("x", "l3", position=(0.1, 0.0, 0.2)), sdyn.Frame("y", "l8", position=(0.0, 0.3, 0.0))
+OPEN = tree(UNBALANCED)
+CLOSED = OPEN.close(*ENDS, "revolute", name="one")
+CHANGES = {
+    "close": (OPEN, CLOSED),
+    "close another": (CLOSED, CLOSED.close("e1", "e0", "point", name="two")),
+    "close to ground": (CLOSED, CLOSED.close("e0", "ground", "universal", name="two")),
+    "lock on the loop": (CLOSED, CLOSED.lock({"j2": 0.0})),
+    "lock and close": (OPEN, CLOSED.lock({"j5": 0.0}).close("e1", "e0", "point", name="two")),
+    "re-root": (CLOSED, CLOSED.reroot("l6")),
+    "ground": (CLOSED, CLOSED.ground("l0")),
+    "open": (CLOSED, OPEN),
+    "unlock": (CLOSED.lock({"j2": 0.3}), CLOSED),
+}
+SIZE = sdyn.capacity([x for pair in CHANGES.values() for x in pair] + [CLOSED.close("e1", "e0", "weld", name="two")])
+
+
+@partial(jax.jit, **QUICKLY)
+def jump(before, after, q, v, restitution):
+    chain, q1, v1, impulse = sdyn.transfer(before, after, q, v, restitution=restitution)
+    totals = lambda chain, q, v: (
+        sdyn.momentum(chain, q, v), sdyn.centre_of_mass(chain, q), sdyn.kinetic_energy(chain, q, v)
+    )  # fmt: skip
+    K = sdyn.loop_jacobian(chain, q1)
+    return chain, q1, v1, impulse, K, sdyn.loop_residual(chain, q1), totals(before, q, v), totals(chain, q1, v1)
+
+
+@pytest.fixture
+def start(request, rng):
+    """A state of the first structure of a change, its closures at the relative poses of that state."""
+    one, two = CHANGES[request.param]
+    x = states(one, request.param)
+    loose = replace(one, loops=())
+    before = sdyn.pack(loose, SIZE)
+    q, v = sdyn.pad(before, x.q[0], x.v[0])
+    before, q, v, *_ = jump(before, sdyn.pack(one, SIZE), q, v, 0.0)
+    return request.param, before, sdyn.pack(two, SIZE), q, v
+
+
+@pytest.mark.parametrize("start", CHANGES, indirect=True)
+def test_change(start):
+    """Closed and moving as the closures allow; momentum kept or explained; energy never up; continuous where free."""
+    change, before, after, q, v = start
+    _, two = CHANGES[change]
+    chain, q1, v1, impulse, K, residual, (h0, _, T0), (h1, c, T1) = jump(before, after, q, v, 0.0)
+    close(residual, 0 * residual, 1e-13, scale=1.0)
+    close(K @ v1, 0 * (K @ v1), 1e-11, scale=v1)
+    assert T1 <= T0 * (1 + 1e-12)
+    n = SIZE.links
+    outer = np.zeros(6)
+    R, p = sdyn.body_poses(chain, q1)
+    for k, name in enumerate(SIZE.loop_names):
+        loop = next((x for x in two.loops if x.name == name and x.frame_b.link == "ground"), None)
+        if loop:
+            link = SIZE.link_names.index(loop.frame_a.link)
+            outer += moved(impulse[n + k], p[link] + R[link] @ loop.frame_a.position, c)
+    if two.grounded:
+        outer += moved(impulse[SIZE.link_names.index(two.base)], p[SIZE.link_names.index(two.base)], c)
+    close(np.asarray(h1), np.asarray(h0) + outer, 1e-11, scale=h0)
+    if change in ("open", "unlock", "re-root"):
+        close(T1, T0, 1e-12)
+        close(impulse, 0 * impulse, 1e-12, scale=h0)
+
+
+def moved(wrench, x, c):
+    """A wrench about x, about c."""
+    wrench, arm = np.asarray(wrench), np.asarray(x) - np.asarray(c)
+    return np.r_[wrench[:3] + np.cross(arm, wrench[3:]), wrench[3:]]
+
+
+@pytest.mark.parametrize("start", ["close", "close another", "lock and close"], indirect=True)
+def test_restitution(start):
+    """New closures part at a fraction of the rate at which they met, old ones stay closed; energy in between."""
+    change, before, after, q, v = start
+    out = {e: jump(before, after, q, v, e) for e in (0.0, 0.5, 1.0)}
+    K, T = out[0.0][4], {e: float(x[-1][2]) for e, x in out.items()}
+    close(K @ out[0.5][2], K @ out[1.0][2] / 2, 1e-11, scale=v)
+    close(out[0.5][2], (out[0.0][2] + out[1.0][2]) / 2, 1e-12)
+    close(out[1.0][-1][0], out[0.0][-1][0], 1e-11)
+    T0 = float(out[0.0][-2][2])
+    assert T[0.0] < T[0.5] < T[1.0] <= T0 * (1 + 1e-12)
+    if change == "close":
+        close(T[1.0], T0, 1e-12)
+    if change == "close another":
+        old = np.arange(SIZE.rows) < 5
+        close((K @ out[1.0][2])[old], np.zeros(5), 1e-11, scale=v)
+
+
+@pytest.mark.slow
+def test_a_thousand_changes():
+    """Random locks, bases, grounds and loops of the 37-DOF robot: momentum 1e-10, energy never up, one compilation."""
+    rng = np.random.default_rng(37)
+    paper = sdyn.models.load("paper37")
+    hands = [frame.name for frame in paper.frames]
+    joints = [joint.name for joint in paper.moving]
+    closable = {f"grip{k}": (hands[k], "ground") for k in range(2)} | {"pair": (hands[1], hands[2])}
+    everything = paper
+    for name, ends in closable.items():
+        everything = everything.close(*ends, name=name)
+    size = sdyn.capacity([everything])
+    run = jax.jit(lambda *x: jump.__wrapped__(*x, 0.0), **QUICKLY)
+    mine, chain = paper, sdyn.pack(paper, size)
+    q, v = sdyn.pad(chain, paper.neutral(), 0.1 * rng.normal(size=paper.nv))
+    q = q.at[7 : 7 + len(joints)].set(rng.uniform(-1, 1, len(joints)))
+    worst, rises, grounds = 0.0, 0, 0
+    for k in range(1000):
+        mine = changed(mine, rng, joints, closable)
+        before = mine, chain
+        chain, q, v, _, _, residual, (h0, _, T0), (h1, _, T1) = run(chain, sdyn.pack(mine, size), q, v)
+        touching = mine.grounded or any(loop.frame_b.link == "ground" for loop in mine.loops)
+        grounds += touching
+        if not touching:
+            worst = max(worst, np.abs(h1 - h0).max() / np.abs(h0).max())
+        rises += bool(T1 > T0 * (1 + 1e-10))
+        assert np.isfinite(q).all() and np.abs(residual).max() < 1e-10, before
+        # push everything a little, as far as the structure allows, so that motion does not die out
+        push = sdyn.pad(chain, mine.neutral(), 0.02 * rng.normal(size=mine.nv))[1]
+        v = sdyn.project(chain, q, v + push)[1] if k % 10 == 9 else v
+    assert rises == 0 and worst < 1e-10, (rises, worst)
+    assert run._cache_size() == 1 and 100 < grounds < 900
+
+
+def changed(robot, rng, joints, closable):
+    """The robot after one random change that it allows."""
+    loops = {loop.name for loop in robot.loops}
+    while True:
+        kind = rng.choice(["lock", "unlock", "reroot", "ground", "release", "close", "open"])
+        if kind == "lock" and len(robot.locked) < 20:
+            return robot.lock({rng.choice([x for x in joints if x not in robot.locked]): 0.0})
+        if kind == "unlock" and robot.locked:
+            return robot.unlock([rng.choice(list(robot.locked))])
+        if kind == "reroot" and not robot.grounded:
+            return robot.reroot(rng.choice([link.name for link in robot.links]))
+        if kind == "ground" and not robot.grounded:
+            return robot.ground(robot.base)
+        if kind == "release" and robot.grounded:
+            return robot.release()
+        if kind == "close" and len(loops) < len(closable):
+            name = rng.choice([x for x in closable if x not in loops])
+            return robot.close(*closable[name], name=name)
+        if kind == "open" and loops:
+            return robot.open(rng.choice(list(loops)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grounded", [False, True])
+def test_gradient_of_a_capture(grounded, rng):
+    """One second of two arms: approach, capture of the target by the second hand, closed, release.
+
+    With respect to the initial state, the torques, the target's inertia and the times of capture and release.
+    """
+    free = mechanisms.two_arms()
+    mine = free.reroot("l_base").ground("l_base") if grounded else free
+    both = [free, free.close("r_hand", "handle", name="grip"), free.ground(free.base)]
+    size = sdyn.capacity([*both, both[1].ground(free.base)])
+    family = [sdyn.pack(x, size) for x in (mine, mine.close("r_hand", "handle", name="grip"))]
+    family = jax.tree.map(lambda *x: jnp.stack(x), *family)
+    joints = rng.uniform(-1, 1, 14)
+    base = [] if grounded else [0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5]
+    q, v = sdyn.pad(sdyn.pack(mine, size), np.r_[base, joints], 0.1 * rng.normal(size=mine.nv))
+    target = size.link_names.index(free.links[-1].name)
+    taus = 0.5 * rng.normal(size=(3, 20, 20)) * (np.arange(20) >= 6)
+    x = q, v, taus, np.array([0.35, 0.4, 0.25]), np.asarray(family.link_inertia[0, target])
+    assert mine.nv == (14 if grounded else 20)
+    w = rng.normal(size=(2, 20))
+    run = capture_slope()
+    along = [rng.normal(size=np.shape(y)) for y in x]
+    along[1] = along[1] * (np.arange(20) >= (6 if grounded else 0))
+    along[2], along[3] = along[2] * (np.arange(20) >= 6), 0.1 * along[3]
+    along[4] = 0.05 * np.trace(x[4]) * (along[4] + along[4].T)
+    if grounded:
+        along[0] = along[0] * (np.arange(21) >= 7)
+    _, g = run(family, target, w, x)
+    for k, name in enumerate(("q", "v", "torques", "times", "inertia")):
+        only = tuple(d if i == k else np.zeros_like(d) for i, d in enumerate(along))
+        want = differences(lambda x: run(family, target, w, x)[0], x, only, 1e-4)
+        close((np.asarray(g[k]) * along[k]).sum(), want, 1e-6, scale=1.0), name
+    assert run._cache_size() == 1
+
+
+def capture_slope(found=[]):  # noqa: B006  (compiled once)
+    def value(family, target, w, x):
+        q, v, taus, durations, inertia = x
+        new = family.link_inertia.at[:, target].set(inertia)
+        family = jax.vmap(lambda chain, I: sdyn.with_params(chain, replace(sdyn.params(chain), inertia=I)))(family, new)
+        out = sdyn.hybrid_rollout(family, q, v, taus, durations, jnp.array([0, 1, 0]))
+        return w[0, :14] @ out.q[-1, -1, 7:21] + w[1] @ out.v[-1, -1] + (jnp.sin(out.impulse[1])).sum() * 0.1
+
+    if not found:
+        found.append(jax.jit(jax.value_and_grad(value, 3), **QUICKLY))
+    return found[0]
