@@ -38,9 +38,9 @@ def gradient(robot, batch: int) -> Contender:
     return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
 
 
-def jacobians(robot, batch: int) -> Contender:
-    """All derivatives d vdot / d (q, v, tau)."""
-    all_slopes = jax.jacfwd(lambda x, chain: sdyn.forward_dynamics(chain, *x))
+def jacobians(robot, batch: int, by=jax.jacrev) -> Contender:
+    """All derivatives d vdot / d (q, v, tau), by `jax.jacrev` or `jax.jacfwd`."""
+    all_slopes = by(lambda x, chain: sdyn.forward_dynamics(chain, *x))
     f = lambda chain, x: jax.tree.map(lambda J: J.sum(1), jax.vmap(all_slopes, (0, None))(x, chain))
     return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
 

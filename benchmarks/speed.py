@@ -73,13 +73,15 @@ def forward(robot, kinds):
 def of_full(full, reduced):
     """The contenders of this library that only the table of ratios needs."""
     import contenders
+    import jax
 
     import sdyn
 
     return {
         "sdyn, batch 1024": contenders.forward(full, 1024),
         "sdyn, gradient, batch 256": contenders.gradient(full, 256),
-        "sdyn, Jacobians, batch 64": contenders.jacobians(full, 64),
+        "sdyn, jacrev, batch 64": contenders.jacobians(full, 64, jax.jacrev),
+        "sdyn, jacfwd, batch 64": contenders.jacobians(full, 64, jax.jacfwd),
         "9-DOF form": contenders.forward(reduced, 256),
         PADDED: contenders.forward(reduced, 256, capacity=sdyn.capacity([full, reduced])),
     }
@@ -87,15 +89,17 @@ def of_full(full, reduced):
 
 def ratios(times) -> list[dict]:
     """What is compared with what, as the median over the rounds."""
-    best = lambda names: min((name for name in names if name in times), key=lambda name: times[name].mean(), default="")
+    median = lambda name: sorted(times[name])[len(times[name]) // 2]
+    best = lambda names: min((name for name in names if name in times), key=median, default="")
     aba = best(["pin.aba", "pin.aba (world)"])
     one = best([f"sdyn, batch 1, width {w}" for w in WIDTHS])
+    all_slopes = best(["sdyn, jacrev, batch 64", "sdyn, jacfwd, batch 64"])
     rows = [
         ("forward dynamics, batch 256", aba, "sdyn, batch 256"),
         ("forward dynamics, batch 256, float32", aba, "sdyn float32, batch 256"),
         ("forward dynamics, batch 1, in a loop", aba, one),
         ("gradient (q, v, tau), batch 256", "pin.computeABADerivatives", "sdyn, gradient, batch 256"),
-        ("Jacobians (q, v, tau), batch 64", "pin.computeABADerivatives", "sdyn, Jacobians, batch 64"),
+        ("Jacobians (q, v, tau), batch 64", "pin.computeABADerivatives", all_slopes),
         ("forward dynamics, batch 1024", "MJX, batch 1024", "sdyn, batch 1024"),
         ("forward dynamics, batch 256", "JaxSim, batch 256", "sdyn, batch 256"),
         ("forward dynamics, batch 256", "mj_forward", "sdyn, batch 256"),

@@ -80,8 +80,8 @@ def chart(result, path):
         spread.append([times[key]["p90_us"] - times[key]["median_us"] for key in keys])
         colours = ["#1f6fb4" if key.startswith("sdyn") else "#9aa5b1" for key in keys]
         axes.barh(keys, medians, xerr=spread, color=colours, ecolor="#444444")
-        for k, x in enumerate(medians):
-            axes.annotate(f" {x:.2g}", (x, k), va="center", fontsize=8)
+        for k, key in enumerate(keys):
+            axes.annotate(f" {medians[k]:.3g}", (times[key]["p90_us"], k), va="center", fontsize=8)
         axes.set(xscale="log", title=name, xlabel="us a sample")
         axes.margins(x=0.2)
     panels[0].invert_yaxis()
