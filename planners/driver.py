@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from planners import sqp
 from planners.certify import certify
@@ -27,7 +28,8 @@ def plan(
     Args:
         task: From `planners.load`.
         solver: "sqp".
-        seeds: First guesses; with more than one, each is improved by a descent and the best is solved.
+        seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
+            result that is certified is kept.
         accuracy: "draft" (half of the task's intervals), "standard" or "fine" (twice); standard if left out.
         progress: Whether to show a live table.
 
@@ -46,22 +48,37 @@ def plan(
         live.compiling("the task")
         problem = module.problem(task, fine)
         live.compiling("first guesses")
-        z = module.first_guess(task, problem, seeds)
+        z = module.first_guesses(task, problem, seeds)
         live.compiling("the problem and the solver")
-        sqp.compile_all(problem.form, z, problem.numbers)
+        sqp.compile_all(problem, seeds)
         history = []
-        for state in sqp.solve(problem.form, z, problem.numbers, iterations=ITERATIONS):
-            history.append((state.iteration, float(state.near.cost), state.violation))
-            live.iteration(*history[-1], state.step)
+        # matrices of a few hundred rows: two threads of BLAS are no faster, and ten times slower where others compute
+        with threadpool_limits(1, "blas"):
+            for state in sqp.solve(problem, z, iterations=ITERATIONS):
+                best = sqp.pick(state, sqp.ranking(state)[0])
+                history.append((len(history), float(best.near.cost), float(best.violation)))
+                live.iteration(*history[-1], float(best.step), sqp.running(state))
         live.compiling("the certificate")
-        found = _result(task, problem, module, state, np.array(history), (seeds, fine, accuracy or "standard"))
+        options = seeds, fine, accuracy or "standard"
+        ends = [sqp.pick(state, k) for k in sqp.ranking(state)]
+        found = _best(_result(task, problem, module, end, np.array(history), options) for end in ends)
+    timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
+    return replace(found, timing=timing)
+
+
+def _best(results) -> Plan:
+    """The first of several results, from the best to the worst, that is certified; else the first of all."""
+    first = None
+    for found in results:
         if found.status == "solved":
-            certificate = certify(task, found)
+            certificate = certify(found.task, found)
             status = "solved" if certificate.passed else "not converged"
             verdict = f"{found.verdict} {certificate.sentence}"
             found = replace(found, certificate=certificate, status=status, verdict=verdict)
-    timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
-    return replace(found, timing=timing)
+        if found.status == "solved":
+            return found
+        first = first or found
+    return first
 
 
 def _checked(solver, seeds, accuracy) -> float:
@@ -85,20 +102,22 @@ def _result(task, problem, module, state, history, options):
         "options": {"solver": "sqp", "seeds": seeds, "accuracy": accuracy, "fine": fine},
         "sizes": {"variables": len(state.z), "equalities": len(state.y), "inequalities": len(state.u)},
         "cost": float(state.near.cost),
-        "stationarity": state.stationarity,
+        "stationarity": float(state.stationarity),
         "results": module.results(task, problem, x),
     }
     phases = module.phases(task, problem.data, x, round(FINE * max(fine, 1.0)))
     multipliers = {"equal": np.asarray(state.y), "below": np.asarray(state.u)}
     verdict = _verdict(problem, state, x, module, info)
-    return Plan(task, phases, state.status, verdict, x, multipliers, history, {}, info)
+    return Plan(task, phases, sqp.STATUSES[state.status], verdict, x, multipliers, history, {}, info)
 
 
 def _verdict(problem, state, x, module, info):
     worst = "; ".join(f"{name} is off by {amount:.3g} {unit}" for name, amount, unit in _worst(problem, state))
-    if state.status == "infeasible":
-        return f"No motion was found that keeps all constraints: {worst}."
-    if state.status == "not converged":
+    if state.status == sqp.INFEASIBLE:
+        held = problem.holding(state.near.below, state.u)
+        most = f" What holds it back most is the {held}." if held else ""
+        return f"No motion was found that keeps all constraints: {worst}.{most}"
+    if state.status == sqp.UNCONVERGED:
         end = f": {worst}." if worst else "."
         return f"The solver stopped before the optimum after {state.iteration} iterations{end}"
     return module.sentence(x, info["results"])

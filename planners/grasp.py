@@ -216,7 +216,7 @@ class Grasp:
             two_sided(jnp.concatenate(P), data.position[:, 0], data.position[:, 1]),
             two_sided(jnp.concatenate(rates), -1.0, 1.0),
             two_sided(torque, data.margin - 1, 1 - data.margin),
-            two_sided(jnp.concatenate([spin, slide], axis=1) / data.speed, -0.5, 0.5),
+            two_sided(jnp.concatenate([spin, slide], axis=1), -data.speed / 2, data.speed / 2),
         )
         return Values(
             data.weights[0] * T.sum(),
@@ -236,7 +236,7 @@ def rows(task: Task, grid: Grid, poses):
         Rows(f"velocity of {hand!r} relative to {grip!r}", 1.0, "m/s", (2, 3)),
     )
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
-    steady = Rows("velocity while tracking", task.tolerance.speed, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
+    steady = Rows("velocity while tracking", 1.0, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
     return equal, (*limit_rows(task, points, points - 3, torques), steady)
 
 
@@ -354,16 +354,13 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     return Problem(form, data(task), {"durations": low}, {"durations": high}, *rows(task, grid, poses))
 
 
-def first_guess(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """The best of `count` first guesses, scaled."""
+def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
+    """First guesses [count, n], scaled; several are improved by a descent."""
     from planners import seeds
 
     form = problem.form
     z = np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, count)])
-    if count == 1:
-        return z[0]
-    z, merits = seeds.improve(form, z, problem.numbers)
-    return np.asarray(z[np.argmin(merits)])
+    return z if count == 1 else seeds.improve(form, z, problem.numbers)
 
 
 def results(task: Task, problem: Problem, x: dict) -> dict:

@@ -211,8 +211,8 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     return Problem(form, data(task), {"duration": low}, {"duration": high}, (), (*below, turn))
 
 
-def first_guess(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """The best of some smooth random motions, scaled."""
+def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
+    """The best of some smooth random motions [count, n], scaled; several are improved by a descent."""
     from planners import seeds
 
     rng, form = np.random.default_rng(0), problem.form
@@ -220,15 +220,14 @@ def first_guess(task: Task, problem: Problem, count: int) -> np.ndarray:
     knots = np.linspace(0, 1, shape[0])[:, None]
     low, high = task.phases["excite"].duration
     guesses = []
-    for _ in range(max(count, 8)):
+    for _ in range(max(2 * count, 8)):
         waves = sum(rng.normal(size=shape[1]) * np.sin(np.pi * k * knots) / k for k in range(1, 6))
         swing = 0.12 * waves * task.rate_limits * high
         inside = np.clip(task.start + swing, 0.9 * task.position_limits[:, 0], 0.9 * task.position_limits[:, 1])
         guesses.append(form.join({"duration": [(low + high) / 2], "excite": inside}))
-    z, merits = np.stack(guesses), seeds.merits(form, np.stack(guesses), problem.numbers)
-    if count > 1:
-        z, merits = seeds.improve(form, z, problem.numbers)
-    return np.asarray(z[np.argmin(merits)])
+    z = np.stack(guesses)
+    z = z[np.argsort(seeds.merits(form, z, problem.numbers), kind="stable")[:count]]
+    return z if count == 1 else seeds.improve(form, z, problem.numbers)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

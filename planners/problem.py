@@ -161,3 +161,9 @@ class Problem:
                 at += rows.size
                 out.append((amount, (rows.name, float(amount * rows.scale), rows.unit)))
         return [x for amount, x in sorted(out, key=lambda x: -x[0])[:count] if amount > 0]
+
+    def holding(self, below, u) -> str | None:
+        """The inequalities that hold, and whose multipliers u are largest in sum; None if there are none."""
+        ends = np.cumsum([rows.size for rows in self.below])[:-1]
+        weights = [part.sum() for part in np.split(np.where(below <= 1e-6, u, 0.0), ends)] if self.below else [0.0]
+        return self.below[np.argmax(weights)].name if max(weights) > 1e-3 else None

@@ -129,7 +129,7 @@ class Live:
         return Group(*parts, self._table()) if self._rows else Group(*parts)
 
     def _table(self):
-        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+        table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim")  # 75 columns where all cells are full
         titles = ["iteration", "cost", "feasibility", "step", "elapsed", "time left"]
         for title in titles + (["seeds"] if self.seeds > 1 else []):
             table.add_column(title, justify="right")

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 ITERATIONS = 60
 TOLERANCE = 1e-10  # of the complementarity and the residuals, relative to the data
+PATIENCE = 5  # iterations without a better point
 TO_BOUNDARY = 0.995
 
 
@@ -43,14 +44,24 @@ class Point(NamedTuple):
     dual: tuple  # of the same shapes
 
 
+class Progress(NamedTuple):
+    """Where the iteration is, and the best that it has seen."""
+
+    now: Point
+    best: Point
+    gap: jax.Array  # [] of the best
+    count: jax.Array  # [] iterations
+    worse: jax.Array  # [] iterations in a row without a better point
+
+
 def solve(q: Programme):
-    """Solution of a programme.
+    """Solution of a programme: the best point before rounding takes over, where the tolerance is out of reach.
 
     Returns:
         (d [n], y [e], u [i]): the step, and the multipliers of the equalities (any sign) and inequalities (>= 0).
     """
-    start = _start(q)
-    x, _, _ = jax.lax.while_loop(lambda s: (s[1] < ITERATIONS) & (s[2] > TOLERANCE), lambda s: _step(q, *s), start)
+    goes_on = lambda s: (s.count < ITERATIONS) & (s.gap > TOLERANCE) & (s.worse < PATIENCE)
+    x = jax.lax.while_loop(goes_on, lambda s: _step(q, s), _start(q)).best
     return x.d, x.y, x.dual[3]
 
 
@@ -65,15 +76,16 @@ def _start(q):
     one = jnp.maximum(jnp.abs(e).max(initial=0.0), 1.0) * 0.1
     p, n = jnp.maximum(e, 0) + one, jnp.maximum(-e, 0) + one
     t = jnp.maximum(i, 0) + one
-    half_e, half_i = jnp.full_like(q.a, nu), jnp.full_like(q.c, 0.5 * nu)
-    bound = jnp.full_like(q.g, 0.1 * _scale(q))
+    full, half, least = jnp.full_like(q.a, nu), jnp.full_like(q.c, 0.5 * nu), 0.1 * _scale(q)
+    slope = q.H @ mid + q.g + half @ q.C  # the duals of the bounds balance it: no residual is left but complementarity
+    bounds = least + jnp.maximum(slope, 0.0), least + jnp.maximum(-slope, 0.0)
     x = Point(
         mid,
         jnp.zeros_like(q.a),
         (p, n, t, t - i, mid - q.lower, q.upper - mid),
-        (half_e, half_e, half_i, half_i, bound, bound),
+        (full, full, half, half, *bounds),
     )
-    return x, 0, jnp.asarray(jnp.inf, q.g.dtype)
+    return Progress(x, x, jnp.asarray(jnp.inf, q.g.dtype), jnp.asarray(0), jnp.asarray(0))
 
 
 def _residuals(q, x):
@@ -154,19 +166,19 @@ def _move(x, dx, primal, dual):
     return Point(x.d + primal * dx.d, x.y + dual * dx.y, along(x.slack, dx.slack, primal), along(x.dual, dx.dual, dual))
 
 
-def _step(q, x, k, gap):
+def _step(q, s: Progress) -> Progress:
+    x = s.now
     factors, r, mu = _factor(q, x), _residuals(q, x), _average(x)
     products = tuple(a * b for a, b in zip(x.slack, x.dual, strict=True))
     trial = _direction(q, x, r, factors, products)
     length = jnp.minimum(_longest(x.slack, trial.slack), _longest(x.dual, trial.dual))
     centre = (_average(_move(x, trial, length, length)) / mu) ** 3 * mu
-    targets = tuple(
-        c + a * b - centre for c, a, b in zip(products, trial.slack, trial.dual, strict=True)
-    )
+    targets = tuple(c + a * b - centre for c, a, b in zip(products, trial.slack, trial.dual, strict=True))
     dx = _direction(q, x, r, factors, targets)
-    length = TO_BOUNDARY * jnp.minimum(_longest(x.slack, dx.slack) , _longest(x.dual, dx.dual))
+    length = TO_BOUNDARY * jnp.minimum(_longest(x.slack, dx.slack), _longest(x.dual, dx.dual))
     new = _move(x, dx, length, length)
-    new_gap = _gap(q, new)
-    good = jnp.isfinite(new_gap)
-    x = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, x)
-    return x, jnp.where(good, k + 1, ITERATIONS), jnp.where(good, new_gap, gap)
+    gap = _gap(q, new)
+    better = gap < s.gap
+    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, s.best)
+    worse = jnp.where(better, 0, jnp.where(jnp.isfinite(gap), s.worse + 1, PATIENCE))
+    return Progress(new, best, jnp.where(better, gap, s.gap), s.count + 1, worse)

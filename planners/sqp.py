@@ -1,24 +1,26 @@
-"""Dense sequential quadratic programming with an l1 merit function and a trust region.
+"""Dense sequential quadratic programming with an l1 merit function and a trust region, for several starts at once.
 
 Each iteration solves one elastic programme (`qp`) in a box around the point. The curvature is Gauss-Newton plus a
 symmetric rank-one correction that learns, from short steps, what Gauss-Newton leaves out (the constraints'
 curvature); negative directions are mirrored. A step that does not pay is first bent (second-order correction), then
-shortened.
+shortened. The penalty grows only where the linearised constraints gain by it.
 
-The loop runs on the host, so that it can be watched; three compiled functions do the work.
-Source: Fletcher's S l1 QP; Nocedal and Wright, Numerical Optimization, chapters 6 and 18.
+The functions below are for one start and are vmapped over all of them: a start that has ended waits, unchanged. The
+loop runs on the host, so that it can be watched; three compiled functions do the work.
+Source: Fletcher's S l1 QP; Nocedal and Wright, Numerical Optimization, chapters 6 and 18; Byrd, Nocedal and Waltz
+(2008), Steering exact penalty methods.
 """
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from planners import qp
-from planners.problem import Form, Linear
+from planners.problem import Form, Linear, Problem
 
 FEASIBLE = 1e-9  # scaled violation
 STATIONARY = 1e-6  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
@@ -28,34 +30,54 @@ LENGTHS = 0.5 ** np.arange(8.0)
 WORTH = 0.1  # part of the predicted decrease that a step must bring
 NOISE = 1e-10  # relative change of the merit that says nothing: steps within it are taken, or the radius would collapse
 LEARN_BELOW = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
-RADII = (1e-10, 2.0)  # smallest and largest trust region, scaled variables
+RADII = (1e-6, 0.1, 2.0)  # trust region, scaled variables: smallest, at least after a larger penalty, largest
+STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more penalty, one gained is worth it
+IDLE = 2  # iterations without progress after which more penalty is tried anyway
 PATIENCE = 8  # iterations without progress
-STALLED = 20  # iterations at the largest penalty in which the violation does not fall by a hundredth: infeasible
+STALLED = 12  # iterations in which neither the violation falls by a hundredth nor the penalty grows: infeasible
+STATUSES = ("running", "solved", "infeasible", "not converged")
+RUNNING, SOLVED, INFEASIBLE, UNCONVERGED = range(4)
 
 
-@dataclass(frozen=True)
-class State:
-    """Where the solver is."""
+class State(NamedTuple):
+    """Where the solver is; of several starts, all arrays have a leading axis."""
 
-    z: np.ndarray  # [n]
+    z: jax.Array  # [n]
     near: Linear  # the problem at z
-    y: np.ndarray  # [e] multipliers of the equalities
-    u: np.ndarray  # [i] multipliers of the inequalities
-    left_out: np.ndarray  # [n, n] curvature that Gauss-Newton leaves out
-    radius: float
-    penalty: float
-    iteration: int = 0
-    step: float = 0.0  # largest entry of the last step
-    stationarity: float = np.inf
-    idle: int = 0  # iterations in a row without progress
-    least: float = np.inf  # smallest total violation so far
-    stalled: int = 0  # iterations in a row, at the largest penalty, without a smaller one
-    status: str = "running"  # then "solved", "infeasible" or "not converged"
+    y: jax.Array  # [e] multipliers of the equalities
+    u: jax.Array  # [i] multipliers of the inequalities
+    left_out: jax.Array  # [n, n] curvature that Gauss-Newton leaves out
+    radius: jax.Array  # []
+    penalty: jax.Array  # []
+    violation: jax.Array  # [] the largest one, scaled
+    stationarity: jax.Array  # []
+    step: jax.Array  # [] largest entry of the last step
+    least: jax.Array  # [] total violation when it last fell by a hundredth
+    idle: jax.Array  # [] iterations in a row without progress
+    stalled: jax.Array  # [] iterations since then
+    iteration: jax.Array  # []
+    status: jax.Array  # [] index into STATUSES
 
-    @property
-    def violation(self) -> float:
-        """Largest violation, scaled."""
-        return float(violation(self.near.equal, self.near.below)[1])
+
+class Step(NamedTuple):
+    """What the quadratic programme says."""
+
+    d: jax.Array  # [n]
+    y: jax.Array  # [e]
+    u: jax.Array  # [i]
+    penalty: jax.Array  # []
+    now: jax.Array  # [] merit
+    predicted: jax.Array  # [] its decrease
+    left: jax.Array  # [] total violation that d leaves, and the largest one
+    most: jax.Array  # []
+
+
+class Found(NamedTuple):
+    """What the search along a step says."""
+
+    z: jax.Array  # [n] the next point
+    length: jax.Array  # [] of the step; 0 if none pays
+    gain: jax.Array  # [] of merit
 
 
 def violation(equal, below):
@@ -71,143 +93,190 @@ def merit(form: Form, z, data, penalty):
     return jnp.where(jnp.isfinite(total), total, jnp.inf), v.equal
 
 
-def subproblem(near: Linear, left_out, low, high, penalty):
-    """The step d, the multipliers, the predicted merit, and the largest and total violation that d leaves."""
-    H = near.curvature + left_out
+def direction(s: State, low, high, penalty) -> Step:
+    """The step of the quadratic programme in the trust region."""
+    near = s.near
+    H = near.curvature + s.left_out
     values, vectors = jnp.linalg.eigh((H + H.T) / 2)
     floor = 1e-8 * jnp.maximum(jnp.abs(values).max(), 1.0)
     H = (vectors * jnp.maximum(jnp.abs(values), floor)) @ vectors.T
-    d, y, u = qp.solve(qp.Programme(H, near.gradient, near.A, near.equal, near.C, near.below, low, high, penalty))
-    total, most = violation(near.equal + near.A @ d, near.below + near.C @ d)
-    return d, y, u, near.cost + near.gradient @ d + d @ H @ d / 2 + penalty * total, most, total
+    box = jnp.maximum(low - s.z, -s.radius), jnp.minimum(high - s.z, s.radius)
+    d, y, u = qp.solve(qp.Programme(H, near.gradient, near.A, near.equal, near.C, near.below, *box, penalty))
+    left, most = violation(near.equal + near.A @ d, near.below + near.C @ d)
+    now = near.cost + penalty * violation(near.equal, near.below)[0]
+    model = near.cost + near.gradient @ d + d @ H @ d / 2 + penalty * left
+    return Step(d, y, u, penalty, now, jnp.maximum(now - model, 0.0), left, most)
 
 
-_near = jax.jit(Form.near, static_argnums=0)
-_merit = jax.jit(merit, static_argnums=0)
-_subproblem = jax.jit(subproblem)
-
-
-def compile_all(form: Form, z, numbers) -> None:
-    """Compiles what `solve` calls, side by side."""
-    data = numbers[0]
-    shape = jax.eval_shape(form.near, jnp.asarray(z), data)
-    near = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-    size = jnp.eye(len(z))
-    with ThreadPoolExecutor(3) as pool:
-        jobs = [
-            pool.submit(_near, form, z, data),
-            pool.submit(_merit, form, z, data, 1.0),
-            pool.submit(_subproblem, near, size, size[0] - 2.0, size[0] + 1.0, 1.0),
-        ]
-        for job in jobs:
-            jax.block_until_ready(job.result())
-
-
-def solve(form: Form, z, numbers, *, iterations: int = 200) -> Iterator[State]:
-    """Iterates from a first guess z (scaled); the last state says how it ended.
-
-    Args:
-        form, numbers: The problem, as in `Problem`.
-        z: First guess [n].
-        iterations: At most.
-    """
+def search(form: Form, s: State, step: Step, numbers) -> Found:
+    """Tries the step at each of LENGTHS, straight and then bent, until one pays."""
     data, low, high = numbers
-    z = np.clip(z, low, high)
-    near = _host(_near(form, z, data))
-    nothing = np.zeros(len(near.equal)), np.zeros(len(near.below))
-    state = State(z, near, *nothing, np.zeros((len(z),) * 2), 0.3, PENALTIES[0])
-    while state.status == "running":
-        yield state
-        state = _iterate(form, state, data, low, high)
-        if state.status == "running" and state.iteration >= iterations:
-            state = replace(state, status="not converged")
-    yield state
+    A, lengths = s.near.A, jnp.asarray(LENGTHS)
+    gram = A @ A.T
+    gram = gram + 1e-12 * jnp.maximum(jnp.trace(gram), 1e-200) * jnp.eye(len(A))
+    factors = jax.scipy.linalg.cho_factor(gram)
+
+    def attempt(carry):
+        trial, _, _, unseen = carry
+        length, bent = lengths[trial // 2], trial % 2
+        z = s.z + length * step.d
+        z = jnp.where(bent, jnp.clip(z - A.T @ jax.scipy.linalg.cho_solve(factors, unseen), low, high), z)
+        value, equal = merit(form, z, data, step.penalty)
+        return trial + 1, z, step.now - value, equal - (1 - length) * s.near.equal
+
+    def goes_on(carry):
+        trial, _, gain, _ = carry
+        pays = gain > WORTH * lengths[jnp.maximum(trial - 1, 0) // 2] * step.predicted - NOISE * jnp.abs(step.now)
+        return (trial < 2 * len(LENGTHS)) & ~((trial > 0) & pays)
+
+    carry = jnp.asarray(0), s.z, jnp.zeros_like(step.now), jnp.zeros_like(s.near.equal)
+    trial, z, gain, _ = jax.lax.while_loop(goes_on, attempt, carry)
+    length = lengths[(trial - 1) // 2]
+    pays = gain > WORTH * length * step.predicted - NOISE * jnp.abs(step.now)
+    return Found(jnp.where(pays, z, s.z), jnp.where(pays, length, 0.0), jnp.where(pays, gain, 0.0))
 
 
-def _host(near):
-    return jax.tree.map(np.asarray, near)
-
-
-def _iterate(form, s: State, data, low, high) -> State:
-    box = np.maximum(low - s.z, -s.radius), np.minimum(high - s.z, s.radius)
-    out = _host(_subproblem(s.near, s.left_out, *box, s.penalty))
-    d, y, u, model, most_left, left = out
-    before = float(violation(s.near.equal, s.near.below)[0])
-    now = s.near.cost + s.penalty * before
-    predicted = max(now - model, 0.0)
-    z, length, gain = _search(form, s, d, now, predicted, (data, low, high))
-    near = _host(_near(form, z, data)) if length else s.near
-    size = float(np.abs(d).max())
-    if length == 1:
-        radius = max(s.radius, 2 * size) if gain > 0.5 * predicted - NOISE * abs(now) else s.radius
-    else:
-        radius = 2 * length * size if length else LENGTHS[-1] * size
-    stuck = most_left > FEASIBLE and left > 0.3 * before
-    progress = gain > NOISE * abs(now)
-    after = float(violation(near.equal, near.below)[0])
-    falls = after < 0.99 * s.least or s.penalty < PENALTIES[1]
-    fresh = State(
+def arrive(form: Form, s: State, step: Step, found: Found, numbers) -> State:
+    """The state at the point that was found; a state that has ended stays."""
+    data, low, high = numbers
+    z, length, gain = found
+    near = form.near(z, data)
+    size, noise = jnp.abs(step.d).max(), NOISE * jnp.abs(step.now)
+    wider = jnp.where(gain > 0.5 * step.predicted - noise, jnp.maximum(s.radius, 2 * size), s.radius)
+    shorter = jnp.where(length > 0, 2 * length, LENGTHS[-1]) * size
+    after, most = violation(near.equal, near.below)
+    raised = step.penalty > s.penalty
+    falls = (after < 0.99 * s.least) | raised
+    radius = jnp.where(length == 1, wider, shorter)
+    radius = jnp.where(raised, jnp.maximum(radius, RADII[1]), radius)
+    new = State(
         z,
         near,
-        y,
-        u,
-        _learn(s.left_out, s.near, near, z - s.z, y, u),
-        float(np.clip(radius, *RADII)),
-        min(10 * s.penalty, PENALTIES[1]) if stuck else s.penalty,
+        step.y,
+        step.u,
+        learn(s.left_out, s.near, near, z - s.z, step.y, step.u),
+        jnp.clip(radius, RADII[0], RADII[2]),
+        step.penalty,
+        most,
+        stationarity(near, step.y, step.u, z, low, high),
+        jnp.abs(z - s.z).max(),
+        jnp.where(falls, after, s.least),
+        jnp.where((gain > noise) | raised, 0, s.idle + 1),
+        jnp.where(falls, 0, s.stalled + 1),
         s.iteration + 1,
-        float(np.abs(z - s.z).max()),
-        _stationarity(near, y, u, z, low, high),
-        0 if progress or (stuck and s.penalty < PENALTIES[1]) else s.idle + 1,
-        min(s.least, after),
-        0 if falls else s.stalled + 1,
+        s.status,
     )
-    return replace(fresh, status=_status(fresh))
+    new = new._replace(status=status(new))
+    return jax.tree.map(lambda a, b: jnp.where(s.status == RUNNING, a, b), new, s)
 
 
-def _search(form, s, d, now, predicted, numbers):
-    """The next point, the length of the step (0 if none pays), and what it gains."""
-    data, low, high = numbers
-    noise = NOISE * abs(now)
-    gram = s.near.A @ s.near.A.T
-    gram = gram + 1e-12 * max(np.trace(gram), 1e-300) * np.eye(len(gram))
-    for length in LENGTHS:
-        straight = s.z + length * d
-        value, equal = _host(_merit(form, straight, data, s.penalty))
-        if now - value > WORTH * length * predicted - noise:
-            return straight, length, now - value
-        if np.isfinite(equal).all():
-            unseen = equal - (1 - length) * s.near.equal
-            bent = np.clip(straight - s.near.A.T @ np.linalg.solve(gram, unseen), low, high)
-            value, _ = _host(_merit(form, bent, data, s.penalty))
-            if now - value > WORTH * length * predicted - noise:
-                return bent, length, now - value
-    return s.z, 0.0, 0.0
-
-
-def _learn(S, old: Linear, new: Linear, step, y, u):
+def learn(S, old: Linear, new: Linear, step, y, u):
     """Symmetric rank-one update, so that Gauss-Newton + S maps the step to the change of the Lagrangian's gradient."""
     gradient = lambda x: x.gradient + y @ x.A + u @ x.C
     miss = gradient(new) - gradient(old) - new.curvature @ step - S @ step
     size = miss @ step
-    if np.abs(step).max() > LEARN_BELOW or abs(size) <= 1e-8 * np.linalg.norm(miss) * np.linalg.norm(step):
-        return S
-    return S + np.outer(miss, miss) / size
+    well = jnp.abs(size) > 1e-8 * jnp.linalg.norm(miss) * jnp.linalg.norm(step)
+    well = well & (jnp.abs(step).max() <= LEARN_BELOW)
+    return S + jnp.where(well, jnp.outer(miss, miss) / jnp.where(well, size, 1.0), 0.0)
 
 
-def _stationarity(near, y, u, z, low, high):
+def stationarity(near, y, u, z, low, high):
     """Largest entry of the gradient of the Lagrangian that no bound holds, and of u times its row."""
     r = near.gradient + y @ near.A + u @ near.C
     held = ((z <= low + 1e-7) & (r > 0)) | ((z >= high - 1e-7) & (r < 0))
-    scale = 1 + np.abs(near.gradient).max()
-    return float(max(np.abs(np.where(held, 0.0, r)).max(), np.abs(u * near.below).max(initial=0.0)) / scale)
+    return qp.max_abs((jnp.where(held, 0.0, r), u * near.below)) / (1 + jnp.abs(near.gradient).max())
 
 
-def _status(s: State) -> str:
+def status(s: State):
+    """Whether to go on, by index into STATUSES."""
     feasible = s.violation <= FEASIBLE
-    if feasible and s.stationarity <= STATIONARY:
-        return "solved"
-    if s.idle < PATIENCE and (feasible or s.stalled < STALLED):
-        return "running"
-    if not feasible:
-        return "infeasible"
-    return "solved" if s.stationarity <= ENOUGH else "not converged"
+    ended = jnp.where(feasible, jnp.where(s.stationarity <= ENOUGH, SOLVED, UNCONVERGED), INFEASIBLE)
+    more = (s.idle < PATIENCE) & (feasible | (s.stalled < STALLED))
+    return jnp.where(feasible & (s.stationarity <= STATIONARY), SOLVED, jnp.where(more, RUNNING, ended))
+
+
+_direction = jax.jit(jax.vmap(direction, (0, None, None, 0)))
+_search = jax.jit(jax.vmap(search, (None, 0, 0, None)), static_argnums=0)
+_arrive = jax.jit(jax.vmap(arrive, (None, 0, 0, 0, None)), static_argnums=0)
+
+
+def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
+    """What `_arrive` takes to the state at first guesses z [s, n]: no step, from nowhere."""
+    s, n = z.shape
+    e, i = (sum(rows.size for rows in groups) for groups in (problem.equal, problem.below))
+    zero, count, full = np.zeros, np.zeros(s, int), lambda x: np.full(s, x)
+    near = Linear(zero(s), zero((s, n)), zero((s, n, n)), zero((s, e)), zero((s, e, n)), zero((s, i)), zero((s, i, n)))
+    reals = full(0.3), full(PENALTIES[0]), zero(s), zero(s), zero(s), full(np.inf)
+    state = State(z, near, near.equal, near.below, near.curvature, *reals, count - 1, count, count - 1, count)
+    step = Step(0 * z, near.equal, near.below, full(PENALTIES[0]), *zero((4, s)))
+    return state, step, Found(z, full(1.0), zero(s))
+
+
+def compile_all(problem: Problem, count: int) -> None:
+    """Compiles what `solve` calls for `count` starts, side by side."""
+    _, low, high = numbers = problem.numbers
+    state, step, found = _blank(problem, np.zeros((count, len(low))))
+    jobs = (
+        (_arrive, problem.form, state, step, found, numbers),
+        (_search, problem.form, state, step, numbers),
+        (_direction, state, low, high, step.penalty),
+    )
+    with ThreadPoolExecutor(len(jobs)) as pool:
+        for job in [pool.submit(*job) for job in jobs]:
+            jax.block_until_ready(job.result())
+
+
+def solve(problem: Problem, z, *, iterations: int = 200) -> Iterator[State]:
+    """Iterates from first guesses; the last state says how each ended.
+
+    Args:
+        problem: What is to be solved.
+        z: First guesses [starts, n], scaled.
+        iterations: At most.
+    """
+    form, numbers = problem.form, problem.numbers
+    _, low, high = numbers
+    state, step, found = _blank(problem, np.clip(z, low, high))
+    state = _arrive(form, state, step, found, numbers)
+    for _ in range(iterations):
+        yield state
+        if not running(state):
+            return
+        step = _steered(state, low, high)
+        state = _arrive(form, state, step, _search(form, state, step, numbers), numbers)
+    yield state._replace(status=np.where(np.asarray(state.status) == RUNNING, UNCONVERGED, state.status))
+
+
+def _steered(state, low, high) -> Step:
+    """The step, with ten times the penalty where that leaves clearly less violation, or where nothing else helps.
+
+    A trust region that is too small for feasible linearised constraints is no reason for a larger penalty.
+    """
+    step = _direction(state, low, high, state.penalty)
+    before = np.asarray(jax.vmap(violation)(state.near.equal, state.near.below)[0])
+    left, penalty = np.asarray(step.left), np.asarray(step.penalty)
+    stuck = (np.asarray(step.most) > FEASIBLE) & (left > STEER[0] * before) & (penalty < PENALTIES[1])
+    stuck &= np.asarray(state.status) == RUNNING
+    if not stuck.any():
+        return step
+    harder = _direction(state, low, high, np.where(stuck, 10 * penalty, penalty))
+    better = (np.asarray(harder.left) < left - STEER[1] * before) | (np.asarray(state.idle) >= IDLE)
+    choose = lambda a, b: np.where((stuck & better).reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b)
+    return jax.tree.map(choose, harder, step)
+
+
+def ranking(state: State) -> np.ndarray:
+    """Starts from the best to the worst: how they ended, then the cost with the largest penalty."""
+    total = jax.vmap(violation)(state.near.equal, state.near.below)[0]
+    merits = np.asarray(state.near.cost + PENALTIES[1] * total)
+    return np.lexsort((merits, np.asarray(state.status) != SOLVED))
+
+
+def running(state: State) -> int:
+    """Number of starts that have not ended."""
+    return int((np.asarray(state.status) == RUNNING).sum())
+
+
+def pick(state: State, k: int) -> State:
+    """The state of one start."""
+    return jax.tree.map(lambda a: np.asarray(a[k]), state)

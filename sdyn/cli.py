@@ -82,10 +82,10 @@ def plan(
     """Plan a task, certify the result, and write it with figures and an animation.
 
     Args:
-        task: A shipped task (grasp, identify), or the path of a .toml file.
+        task: A shipped task (grasp, grasp_planar, identify), or the path of a .toml file.
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
         solver: Which solver; this version has sqp.
-        seeds: How many starting points to improve at once; the best result is kept.
+        seeds: How many starting points to improve and solve at once; the best certified result is kept.
         accuracy: How fine the solver's grid is: half of the task's intervals, as many, or twice as many.
     """
     planners = _planners()

@@ -246,6 +246,23 @@ def test_progress_on_a_terminal_is_a_table():
         assert word in text
 
 
+def test_the_table_of_several_seeds_fits_80_columns(monkeypatch):
+    clock = iter(range(0, 10**6, 700))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+    live = progress.Live("grasp", 4, show=False, iterations=150)
+    for k in range(1, 13):
+        live.iteration(k + 100, -1.23456e-5, 1.2e-10, 1.2e-10, 13 - k)
+    out = io.StringIO()
+    Console(file=out, width=80).print(live._draw())
+    title, heads, *rows = out.getvalue().splitlines()
+    assert title == "grasp (4 seeds)"
+    assert heads.split() == ["iteration", "cost", "feasibility", "step", "elapsed", "time", "left", "seeds"]
+    assert len(rows) == 10 and max(map(len, rows)) <= 80
+    whole = r" +1\d\d +-1.23456e-05 +1.2e-10 1.2e-10 +\d+ min \d\d s < \d+ min \d\d s +"
+    for row, seeds in zip(rows, range(10, 0, -1), strict=True):
+        assert re.fullmatch(f"{whole}{seeds} ?", row)
+
+
 def test_progress_can_be_silent():
     assert shown(True, show=False) == "" == shown(False, show=False)
 

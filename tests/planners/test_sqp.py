@@ -40,6 +40,22 @@ def test_qp_that_has_no_solution_puts_the_multipliers_at_the_penalty():
     assert abs(np.abs(y).max() - 100) < 1e-6
 
 
+def test_qp_with_redundant_rows_has_its_multipliers():
+    """Rows that are zero or there twice, and more of them active than variables: rounding must not take over."""
+    rng = np.random.default_rng(3)
+    q = programme(rng, 8, 3, 30, 1e3)
+    A, C, x = np.zeros((9, 8)), np.repeat(q.C, 2, axis=0), rng.normal(size=8) * 1e-3
+    A[:3], A[3:6] = q.A, q.A
+    C[40:] = 1e3 * C[40:]
+    q = q._replace(A=A, a=-A @ x, C=C, c=-C @ x, lower=-0.01 + 0 * q.lower, upper=0.01 + 0 * q.upper)
+    d, y, u = map(np.asarray, jax.jit(qp.solve)(jax.tree.map(jnp.asarray, q)))
+    assert np.abs(A @ d + q.a).max() < 1e-9 and (C @ d + q.c).max() < 1e-9
+    r = q.H @ d + q.g + y @ A + u @ C
+    held = (np.abs(d) > 0.01 - 1e-7) & (r * d < 0)
+    assert np.abs(np.where(held, 0, r)).max() < 1e-6
+    assert np.abs(u * (C @ d + q.c)).max() < 1e-6 and u.min() >= 0
+
+
 def hock_schittkowski_71(x, data):
     x = x["x"]
     cost = x[0] * x[3] * (x[0] + x[1] + x[2]) + x[2]
@@ -53,31 +69,80 @@ def rosenbrock_on_circle(x, radius):
 
 
 
+def ends(problem, *starts):
+    return list(sqp.solve(problem, np.array(starts, float)))[-1]
+
 
 def last(problem, z):
-    return list(sqp.solve(problem.form, np.asarray(z, float), problem.numbers))[-1]
+    return sqp.pick(ends(problem, z), 0)
+
+
+def said(state):
+    return sqp.STATUSES[state.status]
+
+
+def problem_71():
+    rows = (Rows("norm", 1.0, "", (1,)),), (Rows("product", 1.0, "", (1,)),)
+    return Problem(Form((Block("x", (4,)),), hock_schittkowski_71), 0.0, {"x": 1.0}, {"x": 5.0}, *rows)
 
 
 def test_sqp_solves_hock_schittkowski_71():
-    rows = (Rows("norm", 1.0, "", (1,)),), (Rows("product", 1.0, "", (1,)),)
-    problem = Problem(Form((Block("x", (4,)),), hock_schittkowski_71), 0.0, {"x": 1.0}, {"x": 5.0}, *rows)
-    state = last(problem, [1, 5, 5, 1])
-    assert state.status == "solved"
+    state = last(problem_71(), [1, 5, 5, 1])
+    assert said(state) == "solved"
     assert abs(state.near.cost - 17.0140172891) < 1e-7
     assert np.allclose(state.z, [1, 4.74299963, 3.82114998, 1.37940829], atol=1e-5)
 
 
-def test_sqp_names_the_constraint_that_cannot_hold():
+def circle(radius, box=3.0):
     rows = (Rows("circle", 1.0, "m", (1,)),), (Rows("left", 1.0, "m", (1,)), Rows("right", 1.0, "m", (1,)))
-    problem = Problem(Form((Block("x", (2,)),), rosenbrock_on_circle), 1.0, {"x": -3.0}, {"x": 3.0}, *rows)
+    return Problem(Form((Block("x", (2,)),), rosenbrock_on_circle), radius, {"x": -box}, {"x": box}, *rows)
+
+
+def test_sqp_names_the_constraint_that_cannot_hold():
+    problem = circle(1.0)
     state = last(problem, [-1, 1])
-    assert state.status == "infeasible"
+    assert said(state) == "infeasible" and state.iteration < 60
     (name, amount, unit), *rest = problem.worst(state.near.equal, state.near.below)
     assert name in ("left", "right") and unit == "m" and abs(amount - 0.1) < 1e-6
     assert all(x[1] < 1e-6 for x in rest)
 
 
 def test_the_same_solve_twice_is_identical():
-    rows = (Rows("norm", 1.0, "", (1,)),), (Rows("product", 1.0, "", (1,)),)
-    problem = Problem(Form((Block("x", (4,)),), hock_schittkowski_71), 0.0, {"x": 1.0}, {"x": 5.0}, *rows)
-    assert np.array_equal(last(problem, [1, 5, 5, 1]).z, last(problem, [1, 5, 5, 1]).z)
+    assert np.array_equal(last(problem_71(), [1, 5, 5, 1]).z, last(problem_71(), [1, 5, 5, 1]).z)
+
+
+# -- several starts ----------------------------------------------------------------------------------------------------
+
+
+def two_valleys(x, tilt):
+    x = x["x"]
+    return Values(tilt * x[0], jnp.array([x[0] ** 2 - 1, x[1]]), jnp.array([x[1] - x[0] ** 3 + x[0]]), jnp.zeros(0))
+
+
+VALLEYS = Problem(
+    Form((Block("x", (2,)),), two_valleys), 0.1, {"x": -4.0}, {"x": 4.0}, (Rows("path", 1.0, "m", (1,)),), ()
+)
+STARTS = [[3.0, 2.0], [1.1, 0.0], [-0.4, 0.3], [-2.0, -1.0]]
+
+
+def test_several_starts_are_solved_as_each_alone():
+    states = list(sqp.solve(VALLEYS, np.array(STARTS)))
+    together = states[-1]
+    for k, z in enumerate(STARTS):
+        alone, state = last(VALLEYS, z), sqp.pick(together, k)
+        assert said(state) == said(alone) == "solved"
+        assert np.allclose(state.z, alone.z, atol=1e-6)  # measured: identical
+        ended = [s for s in states if s.status[k] != sqp.RUNNING]
+        assert all(np.array_equal(sqp.pick(s, k).z, state.z) for s in ended)  # what has ended waits
+    assert sqp.running(states[0]) == 4 and sqp.running(together) == 0
+    assert len(set(np.asarray(together.iteration).tolist())) > 1
+
+
+def test_the_best_start_comes_first():
+    together = ends(VALLEYS, *STARTS)
+    order = sqp.ranking(together)
+    costs = np.asarray(together.near.cost)[order]
+    assert np.diff(costs).min() > -1e-9 and costs[-1] - costs[0] > 0.19  # the valleys' bottoms: 0.1 and -0.1
+    assert np.asarray(together.z)[order[0], 0] < -0.9
+    one_lost = together._replace(status=np.where(np.arange(4) == order[0], sqp.INFEASIBLE, together.status))
+    assert sqp.ranking(one_lost)[-1] == order[0]
