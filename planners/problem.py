@@ -163,7 +163,9 @@ class Problem:
         return [x for amount, x in sorted(out, key=lambda x: -x[0])[:count] if amount > 0]
 
     def holding(self, below, u) -> str | None:
-        """The inequalities that hold, and whose multipliers u are largest in sum; None if there are none."""
+        """The group of inequalities that all hold and whose multipliers u are largest in sum; None if there is none."""
         ends = np.cumsum([rows.size for rows in self.below])[:-1]
-        weights = [part.sum() for part in np.split(np.where(below <= 1e-6, u, 0.0), ends)] if self.below else [0.0]
-        return self.below[np.argmax(weights)].name if max(weights) > 1e-3 else None
+        parts = zip(self.below, np.split(below, ends), np.split(u, ends), strict=True) if self.below else ()
+        weights = {rows.name: part.sum() for rows, values, part in parts if values.max() <= 1e-6}
+        name = max(weights, key=weights.get, default=None)
+        return name if name and weights[name] > 1e-3 else None
