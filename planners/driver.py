@@ -114,7 +114,7 @@ def _result(task, problem, module, state, history, options):
 def _verdict(problem, state, x, module, info):
     worst = "; ".join(f"{name} is off by {amount:.3g} {unit}" for name, amount, unit in _worst(problem, state))
     if state.status == sqp.INFEASIBLE:
-        held = problem.holding(state.near.below, state.u)
+        held = problem.holding(state.u, [name for name, _, _ in _worst(problem, state)])
         most = f" What holds it back most is the {held}." if held else ""
         return f"No motion was found that keeps all constraints: {worst}.{most}"
     if state.status == sqp.UNCONVERGED:

@@ -162,10 +162,10 @@ class Problem:
                 out.append((amount, (rows.name, float(amount * rows.scale), rows.unit)))
         return [x for amount, x in sorted(out, key=lambda x: -x[0])[:count] if amount > 0]
 
-    def holding(self, below, u) -> str | None:
-        """The group of inequalities that all hold and whose multipliers u are largest in sum; None if there is none."""
-        ends = np.cumsum([rows.size for rows in self.below])[:-1]
-        parts = zip(self.below, np.split(below, ends), np.split(u, ends), strict=True) if self.below else ()
-        weights = {rows.name: part.sum() for rows, values, part in parts if values.max() <= 1e-6}
+    def holding(self, u, besides=()) -> str | None:
+        """The group of inequalities whose multipliers u are largest in sum, besides some; None if there is none."""
+        parts = np.split(u, np.cumsum([rows.size for rows in self.below])[:-1]) if self.below else ()
+        sums = zip(self.below, parts, strict=True)
+        weights = {rows.name: part.sum() for rows, part in sums if rows.name not in besides}
         name = max(weights, key=weights.get, default=None)
         return name if name and weights[name] > 1e-3 else None
