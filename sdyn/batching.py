@@ -5,10 +5,15 @@ So every kernel is one JAX primitive. Its operands are arrays `(..., B)`, or `(.
 `vmap` folds each new axis into B, and an operand that is not batched stays as it is. Integer operands (the topology)
 have no batch axis: where they are batched (`family`), the structures are run one after the other.
 
+A `grouped` kernel works on columns, the tangents or cotangents of samples. Its operands may also be `(..., s)`, where
+s divides B: the batch is B/s columns of s samples each, the samples contiguous, and the columns share what belongs to
+the sample. So a Jacobian under `vmap` computes what depends on the sample once.
+
 Derivatives are kernels too, made by AD of the kernel's function or by its own `rule`, so they batch alike.
 `custom_vmap` (no reverse mode) and `linear_call` (no batching) cannot do this.
 """
 
+import math
 from functools import cache, cached_property
 
 import jax
@@ -17,36 +22,53 @@ from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+BLOCK = 128
+"""Samples or columns that a CPU works on at once: long rows, and storage that fits the second cache."""
+
 
 class Kernel:
     """A function of arrays `(..., B)` that returns a tuple of such arrays.
 
     Args:
-        fun: The function; differentiable by JAX unless `rule` is given.
-        rule: `(primals, tangents, outputs) -> output tangents`, a tangent being None where it is zero.
+        fun: The function, differentiable by JAX unless `rule` is given. That of a grouped kernel gets arrays
+            `(..., columns, s)`. One with integer operands is called with `whole=True` where JAX will transpose it:
+            its loops must have fixed lengths then.
+        rule: `(primals, tangents) -> outputs, output tangents`, a tangent being None where it is zero.
         linear: Positions of operands in which `fun` is linear; with `transpose`, or by AD.
         transpose: `(operands, cotangents) -> cotangents of the linear operands`, which have None in their places.
         expand: Positions of operands that set the shape of outputs, so that a batch may not share them.
-        tangent_transpose: `(positions with a tangent) -> transpose` of the kernel's tangent, or None for AD.
+        grouped: Whether operands may belong to a sample that several columns share.
     """
 
-    def __init__(self, fun, *, rule=None, linear=(), transpose=None, expand=(), tangent_transpose=None):
-        self.fun, self.rule, self.linear, self.transpose, self.expand = fun, rule, linear, transpose, expand
-        self.tangent_transpose = tangent_transpose
+    def __init__(self, fun, *, rule=None, linear=(), transpose=None, expand=(), grouped=False):
+        self.fun, self.rule, self.linear, self.transpose = fun, rule, linear, transpose
+        self.expand, self.grouped = expand, grouped
 
     def __call__(self, *operands):
         return tuple(_primitive.bind(*operands, kernel=self))
 
+    def apply(self, *operands, whole: bool):
+        """`fun` of operands as it wants them."""
+        return self.fun(*operands, **({"whole": whole} if any(map(_is_index, operands)) else {}))
+
+    def run(self, *operands):
+        """The outputs, in one piece."""
+        if not self.grouped:
+            return self.apply(*operands, whole=False)
+        s, B = _sizes(operands)
+        found = self.apply(*(_columns(x, s, B) for x in operands), whole=False)
+        return tuple(jnp.broadcast_to(y, (*y.shape[:-2], B // s, s)).reshape(*y.shape[:-2], B) for y in found)
+
     @cached_property
     def jitted(self):
-        return jax.jit(self.fun)
+        return jax.jit(self.__call__)
 
 
 _primitive = Primitive("sdyn_kernel")
 _primitive.multiple_results = True
 _primitive.def_impl(lambda *operands, kernel: kernel.jitted(*operands))
 mlir.register_lowering(
-    _primitive, mlir.lower_fun(lambda *operands, kernel: kernel.fun(*operands), multiple_results=True)
+    _primitive, mlir.lower_fun(lambda *operands, kernel: kernel.run(*operands), multiple_results=True)
 )
 
 
@@ -56,8 +78,81 @@ def _is_index(x) -> bool:
 
 @_primitive.def_abstract_eval
 def _abstract(*operands, kernel):
-    shaped = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands]
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(kernel.fun, *shaped)]
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in _shaped(kernel, operands)]
+
+
+def _shaped(kernel, operands):
+    """Shapes and types of the outputs."""
+    return jax.eval_shape(kernel.run, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands))
+
+
+# ---- columns of samples ----------------------------------------------------------------------------------------------
+
+
+def _sizes(operands) -> tuple[int, int]:
+    """Samples s, and columns of them B, a multiple of s."""
+    sizes = {x.shape[-1] for x in operands if not _is_index(x)}
+    B = max(sizes)
+    return max(sizes - {B}, default=B) if len(sizes - {1}) > 1 else B, B
+
+
+def _columns(x, s: int, B: int):
+    """(..., 1), (..., s) or (..., B) -> (..., columns, samples), with 1 where they are shared."""
+    if _is_index(x):
+        return x
+    size = x.shape[-1]
+    if size not in (1, s, B):  # shared by the samples too, in part
+        x, size = jnp.tile(x, s // size), s
+    return x.reshape(*x.shape[:-1], B // s, s) if size == B else x[..., None, :]
+
+
+# ---- blocks ----------------------------------------------------------------------------------------------------------
+
+
+def _blocked(*operands, kernel):
+    """On a CPU: blocks of the batch that fit the cache, one after the other.
+
+    XLA makes one function of a loop and of all that is in it. Outside of loops it starts each operation by itself,
+    which costs more than a small one takes; so a single block is a loop too, of a length that XLA does not know.
+    """
+    shaped = _shaped(kernel, operands)
+    s, B = _sizes(operands) if kernel.grouped else (math.inf, max(x.shape[-1] for x in shaped))
+    s = min(s, B)
+    b = _even(s, BLOCK)
+    k = _even(B // s, max(1, BLOCK // b))
+
+    def body(i, out):
+        i, now = lax.optimization_barrier((i, operands))  # or XLA moves what all blocks share in front of the loop
+        i, j = i // -(-s // b), i % -(-s // b)
+        corner = jnp.minimum(i * k, B // s - k), jnp.minimum(j * b, s - b)
+
+        def part(x):
+            if _is_index(x) or x.shape[-1] == 1:
+                return x
+            if x.shape[-1] == s:
+                return lax.dynamic_slice_in_dim(x, corner[1], b, x.ndim - 1)
+            at = (*(0,) * (x.ndim - 1), *corner)
+            return lax.dynamic_slice(_columns(x, s, B), at, (*x.shape[:-1], k, b)).reshape(*x.shape[:-1], k * b)
+
+        def put(whole, y):
+            y = y.reshape(*y.shape[:-1], k, b)
+            return lax.dynamic_update_slice(whole, y, (*(0,) * (y.ndim - 2), *corner))
+
+        return tuple(put(x, y) for x, y in zip(out, kernel.run(*map(part, now)), strict=True))
+
+    blocks = -(-s // b) * -(-(B // s) // k)
+    for index in filter(_is_index, operands):
+        blocks = jnp.where(index.ravel()[0] >= 0, blocks, 0)
+    empty = tuple(jnp.zeros((*x.shape[:-1], B // s, s), x.dtype) for x in shaped)
+    return tuple(y.reshape(x.shape) for x, y in zip(shaped, lax.fori_loop(0, blocks, body, empty), strict=True))
+
+
+def _even(n: int, most: int) -> int:
+    """Size of a block, so that as few blocks as can be are about equal."""
+    return -(-n // -(-n // most))
+
+
+mlir.register_lowering(_primitive, mlir.lower_fun(_blocked, multiple_results=True), platform="cpu")
 
 
 # ---- vmap ------------------------------------------------------------------------------------------------------------
@@ -70,19 +165,34 @@ def _batch(operands, dims, *, kernel):
     single = [x if d is None else jax.ShapeDtypeStruct((*x.shape[:d], *x.shape[d + 1 :]), x.dtype)
               for x, d in zip(operands, dims, strict=True)]  # fmt: skip
     B = max((x.shape[-1] for x in single if not _is_index(x)), default=1)
+    shared = [d is None and i not in kernel.expand and (i not in kernel.linear or x.shape[-1] == 1)
+              for i, (x, d) in enumerate(zip(operands, dims, strict=True))]  # fmt: skip
+    # the new axis comes last, or before the samples that its columns share
+    columns = kernel.grouped and any(s and not _is_index(x) and x.shape[-1] > 1
+                                     for s, x in zip(shared, operands, strict=True))  # fmt: skip
 
-    def fold(i, x, d):  # (..., b) and the new axis -> (..., B n), b being 1 or B
-        if _is_index(x) or (d is None and x.shape[-1] == 1 and i not in kernel.expand):
+    def fold(x, d, shared):  # (..., b) and the new axis -> (..., B n) or less
+        if _is_index(x) or (shared and (columns or x.shape[-1] == 1)):
             return x
-        x = x[..., None] if d is None else jnp.moveaxis(x, d, -1)
-        return jnp.broadcast_to(x, (*x.shape[:-2], B, n)).reshape(*x.shape[:-2], B * n)
+        x = jnp.broadcast_to(x[..., None], (*x.shape, n)) if d is None else jnp.moveaxis(x, d, -1)
+        *lead, b, _ = x.shape
+        if columns:
+            x = jnp.swapaxes(x, -1, -2)
+            return jnp.tile(x, B // b).reshape(*lead, n * B)
+        if kernel.grouped and b == 1:
+            return x.reshape(*lead, n)
+        x = jnp.tile(x, (B // b, 1)) if b > 1 else jnp.broadcast_to(x, (*lead, B, n))
+        return x.reshape(*lead, B * n)
 
-    folded = [fold(i, x, d) for i, (x, d) in enumerate(zip(operands, dims, strict=True))]
+    folded = [fold(x, d, s) for x, d, s in zip(operands, dims, shared, strict=True)]
     out = _primitive.bind(*folded, kernel=kernel)
-    want = [x.shape[-1] for x in jax.eval_shape(kernel.fun, *single)]
+    want = [x.shape[-1] for x in _shaped(kernel, single)]
 
-    def unfold(y, b):  # (..., B n) -> (..., b, n); the sum is the cotangent of an operand that B shared
-        y = jnp.broadcast_to(y, (*y.shape[:-1], B * n)).reshape(*y.shape[:-1], B, n)
+    def unfold(y, b):  # the sum is the cotangent of an operand that B shared
+        if columns:
+            y = jnp.swapaxes(jnp.broadcast_to(y, (*y.shape[:-1], n * B)).reshape(*y.shape[:-1], n, B), -1, -2)
+        else:
+            y = jnp.broadcast_to(y, (*y.shape[:-1], B * n)).reshape(*y.shape[:-1], B, n)
         return y if b == B else y.sum(-2, keepdims=True)
 
     out = [unfold(y, b) for y, b in zip(out, want, strict=True)]
@@ -108,17 +218,19 @@ batching.primitive_batchers[_primitive] = _batch
 
 
 def _jvp(primals, tangents, *, kernel):
-    out = _primitive.bind(*primals, kernel=kernel)
     given = tuple(not isinstance(t, ad.Zero) and t.dtype != jax.dtypes.float0 for t in tangents)
-    if kernel.rule is not None:
-        slopes = kernel.rule(primals, [t if g else None for t, g in zip(tangents, given, strict=True)], out)
-    elif all(i in kernel.linear for i, g in enumerate(given) if g) and all(given[i] for i in kernel.linear):
-        along = (t if g else p for p, t, g in zip(primals, tangents, given, strict=True))
+    tangents = [t if g else None for t, g in zip(tangents, given, strict=True)]
+    if kernel.linear and all(i in kernel.linear for i, g in enumerate(given) if g):
+        out = _primitive.bind(*primals, kernel=kernel)
+        along = [jnp.zeros_like(x) if i in kernel.linear and t is None else x if t is None else t
+                 for i, (x, t) in enumerate(zip(primals, tangents, strict=True))]  # fmt: skip
         slopes = _primitive.bind(*along, kernel=kernel)
+    elif kernel.rule is not None:
+        out, slopes = kernel.rule(primals, tangents)
     else:
-        along = (t for t, g in zip(tangents, given, strict=True) if g)
-        slopes = _primitive.bind(*primals, *along, kernel=_tangent(kernel, given))
-    return out, list(slopes)
+        out = _primitive.bind(*primals, kernel=kernel)
+        slopes = _tangent(kernel, given)(*primals, *(t for t in tangents if t is not None))
+    return list(out), list(slopes)
 
 
 @cache
@@ -127,40 +239,41 @@ def _tangent(kernel, given) -> Kernel:
     n = len(given)
     positions = [i for i in range(n) if given[i]]
 
-    def fun(*operands):
+    def fun(*operands, whole=False):
         def f(*xs):
             full = list(operands[:n])
             for i, x in zip(positions, xs, strict=True):
                 full[i] = x
-            return tuple(kernel.fun(*full))
+            return tuple(kernel.apply(*full, whole=whole))
 
         # a batch may share the operand and not the tangent, or the other way round
         pairs = [jnp.broadcast_arrays(operands[i], t) for i, t in zip(positions, operands[n:], strict=True)]
         return jax.jvp(f, *map(tuple, zip(*pairs, strict=True)))[1]
 
     everything = tuple(range(n + len(positions)))
-    transpose = kernel.tangent_transpose(positions) if kernel.tangent_transpose else None
-    return Kernel(fun, linear=everything[n:], transpose=transpose, expand=everything if kernel.expand else ())
+    expand = everything if kernel.expand else ()
+    return Kernel(fun, linear=everything[n:], expand=expand, grouped=kernel.grouped)
 
 
 def _transpose(cotangents, *operands, kernel):
     free = tuple(ad.is_undefined_primal(x) for x in operands)
     cotangents = [ad.instantiate_zeros(c) for c in cotangents]
+    shapes = [x.aval.shape for x, f in zip(operands, free, strict=True) if f]
     if kernel.transpose is not None:
         found = kernel.transpose([None if f else x for x, f in zip(operands, free, strict=True)], cotangents)
-        shapes = [x.aval.shape for x, f in zip(operands, free, strict=True) if f]
-        found = [_shared(c, shape) for c, shape in zip(found, shapes, strict=True)]
     else:
         given = [x for x, f in zip(operands, free, strict=True) if not f]
-        like = [jnp.zeros(x.aval.shape, x.aval.dtype) for x, f in zip(operands, free, strict=True) if f]
-        found = _primitive.bind(*given, *like, *cotangents, kernel=_adjoint(kernel, free, len(cotangents)))
-    found = iter(found)
+        _, B = _sizes([*given, *cotangents])
+        like = [jnp.zeros((*x.aval.shape[:-1], B), x.aval.dtype) for x, f in zip(operands, free, strict=True) if f]
+        found = _adjoint(kernel, free, len(cotangents))(*given, *like, *cotangents)
+    found = iter([_shared(c, shape) for c, shape in zip(found, shapes, strict=True)])
     return [next(found) if f else None for f in free]
 
 
 def _shared(cotangent, shape):
-    """The sum over the batch, where the batch shared the operand."""
-    return cotangent if cotangent.shape == shape else cotangent.sum(-1, keepdims=True)
+    """The sum over the columns or samples that shared the operand."""
+    s = shape[-1]
+    return cotangent if cotangent.shape == shape else cotangent.reshape(*shape[:-1], -1, s).sum(-2)
 
 
 @cache
@@ -169,7 +282,7 @@ def _adjoint(kernel, free, outputs: int) -> Kernel:
     given = [i for i, f in enumerate(free) if not f]
     wanted = [i for i, f in enumerate(free) if f]
 
-    def fun(*operands):
+    def fun(*operands, whole=True):
         full = [None] * len(free)
         for i, x in zip(given, operands, strict=False):
             full[i] = x
@@ -181,14 +294,15 @@ def _adjoint(kernel, free, outputs: int) -> Kernel:
             at = list(full)
             for i, x in zip(wanted, xs, strict=True):
                 at[i] = x
-            return tuple(kernel.fun(*at))
+            return tuple(kernel.apply(*at, whole=True))
 
         cotangents = operands[len(free) :]
         wide = [jnp.broadcast_to(c, y.shape) for c, y in zip(cotangents, jax.eval_shape(f, *like), strict=True)]
         return tuple(jax.linear_transpose(f, *like)(tuple(wide)))
 
     n, shapes = len(free), tuple(range(len(given), len(free)))
-    return Kernel(fun, linear=tuple(range(n, n + outputs)), expand=tuple(range(n)) if kernel.expand else shapes)
+    expand = tuple(range(n)) if kernel.expand else shapes
+    return Kernel(fun, linear=tuple(range(n, n + outputs)), expand=expand, grouped=kernel.grouped)
 
 
 ad.primitive_jvps[_primitive] = _jvp

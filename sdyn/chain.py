@@ -136,8 +136,9 @@ class Capacity:
 class Chain:
     """A structure, packed. Everything but `capacity` is traced: a change of structure is a change of data.
 
-    Differentiable in every float array; `slot_value`, `base_value` and `link_pose` follow from the original links and
-    joints (`with_params` derives them anew).
+    Differentiable in every float array; in rotations, axes and quaternions, along those that keep their lengths.
+    `slot_value`, `base_value` and `link_pose` follow from the original links and joints (`with_params` derives them
+    anew).
     """
 
     slot_index: Int[Array, "10 steps width"]

@@ -13,7 +13,7 @@ from sdyn.coordinates import gravity_of, join, pose_of, rates_of, spin, turned_c
 from sdyn.crba import crba
 from sdyn.inputs import expect
 from sdyn.kinematics import link_poses, poses
-from sdyn.rnea import rnea
+from sdyn.rnea_derivatives import rnea
 
 
 def tree_dynamics(
@@ -97,7 +97,8 @@ def solve_mass(chain: Chain, q: Float[Array, " nq"], b: Float[Array, " nv"]) -> 
     """
     q, b = expect(chain, q=q, b=b)
     pose, structure, _, _ = _operands(chain, q, None, None)
-    return join(chain, pose, *_aba.mass_solve(*structure, *rates_of(chain, pose, b)))
+    left = _aba.nothing_saved(chain.dtype)
+    return join(chain, pose, *_aba.mass_solve(*structure, *left, *rates_of(chain, pose, b)))
 
 
 def _operands(chain, q, gravity, f_ext):

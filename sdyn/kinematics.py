@@ -7,46 +7,29 @@ a + A_ang x x + w x (v + w x x), with [w; v] = V and a the linear part of A.
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from sdyn.batching import Kernel
 from sdyn.chain import BaseRow, Chain, LinkRow, SlotRow, index_of
 from sdyn.coordinates import Pose, pose_of, rates_of, spin, turned_columns
 from sdyn.inputs import expect
-from sdyn.materialise import keep
 from sdyn.spatial import cat
-from sdyn.sweep import accelerated, batch_of, by_step, move, place, poses_from, put, steps_of, take
+from sdyn.sweep import batch_of, joints_of, moved, placed, walk_of
 
 
-def _poses(slot_index, slot_value, q, quat):
+def _poses(slot_index, slot_value, q, quat, *, whole=False):
     """Rotation and position [slots + 2, 12, B], motion subspace [slots, 6, B], in base axes."""
-    W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
-    B = batch_of(slot_value, q, quat)
-
-    def outward(stored, x):
-        R, p, S = place(x, keep(take(stored, x.parent)))
-        return put(stored, x.t, W, cat([R.reshape(9, W, -1), p])), S
-
-    start = poses_from(slots, B, slot_value.dtype)
-    stored, S = lax.scan(outward, start, steps_of(slot_index, slot_value, q, quat))
-    return stored, jnp.moveaxis(jnp.broadcast_to(S, (*S.shape[:-1], B)), 2, 1).reshape(slots, 6, B)
+    walk, B = walk_of(slot_index, whole), batch_of(slot_value, q, quat)
+    R, p, S = placed(walk, joints_of(walk, slot_index, slot_value, q, quat), B)
+    return cat([R, p], 1), S[: walk.slots]
 
 
-def _motions(slot_index, slot_value, q, quat, V0, qd, A0, qdd):
+def _motions(slot_index, slot_value, q, quat, V0, qd, A0, qdd, *, whole=False):
     """Rotation, position, twist and spatial acceleration [slots + 2, 24, B], in base axes."""
-    W, slots = slot_index.shape[2], slot_index.shape[1] * slot_index.shape[2]
-    B = batch_of(slot_value, q, quat, V0, qd, A0, qdd)
-
-    def outward(stored, x):
-        x, qd, qdd = x
-        parent = keep(take(stored, x.parent))
-        R, p, S, Sqd, V = move(x, parent, qd)
-        A = accelerated(parent, S, qdd, V, Sqd)
-        return put(stored, x.t, W, cat([R.reshape(9, W, -1), p, V, A])), None
-
-    steps = steps_of(slot_index, slot_value, q, quat), by_step(slot_index, qd), by_step(slot_index, qdd)
-    return (lax.scan(outward, poses_from(slots, B, slot_value.dtype, V0, A0), steps)[0],)
+    walk, B = walk_of(slot_index, whole), batch_of(slot_value, q, quat, V0, qd, A0, qdd)
+    R, p, S = placed(walk, joints_of(walk, slot_index, slot_value, q, quat), B)
+    V, A = moved(walk, S, V0, walk.by_step(qd), A0, walk.by_step(qdd), B)
+    return (cat([R, p, V, A], 1),)
 
 
 poses = Kernel(_poses)

@@ -94,17 +94,22 @@ def _product(A, B):
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def _tangent(operands, tangents, out):
-    """dx = S (db − dG x) + (1 − S G) dG S x: the last term turns x with the null space."""
-    G, dead, tolerance, _ = operands
+def _tangent(operands, tangents):
+    """x, and dx = S (db − dG x) + (1 − S G) dG S x: the last term turns x with the null space."""
+    G, dead, tolerance, b = operands
     dG, _, _, db = tangents
-    (x,) = out
     again = lambda b: solve(G, dead, tolerance, b)[0]
+    x = again(b)
     if dG is None:
-        return (again(db),)
+        return (x,), (again(jnp.zeros_like(b) if db is None else db),)
     dx = again((0 if db is None else db) - _product(dG, x))
     turn = _product(dG, again(x))
-    return (dx + turn - again(_product(G, turn)),)
+    return (x,), (dx + turn - again(_product(G, turn)),)
+
+
+def _constant(operands, tangents):
+    (found,) = rank(*operands)
+    return (found,), (jnp.zeros_like(found),)
 
 
 def _transpose(operands, cotangents):
@@ -112,7 +117,7 @@ def _transpose(operands, cotangents):
 
 
 solve = Kernel(_solve, rule=_tangent, linear=(3,), transpose=_transpose)
-rank = Kernel(_rank, rule=lambda operands, tangents, out: (jnp.zeros_like(out[0]),))
+rank = Kernel(_rank, rule=_constant)
 
 
 def shortest(G, dead, tolerance, b):

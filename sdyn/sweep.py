@@ -1,136 +1,254 @@
-"""What the sweeps over a chain share: storage by slot, operands by step, and the kinematics of one step.
+"""What the sweeps over a chain share: the order of the bodies, storage by slot, and the bodies in the base's frame.
 
 All quantities are in the base's own frame (the ground's, seen from the base, when it is grounded): inertias add up
-without transforms and nothing depends on the pose of the base. Arrays are `(components, W, B)` inside a step and
-`(slots + 2, components, B)` between steps; the last two slots are the base and a dummy.
+without transforms and nothing depends on the pose of the base. Arrays are `(components, W, *B)` inside a step and
+`(slots + 2, components, *B)` between steps; the last two slots are the base and a dummy. B is the batch: one axis, or
+two where many columns share a sample.
+
+What makes a step fast: many rows of B in few elementwise operations; a concatenation is stored (`keep`) before it is
+used; a parent's value that several operations read is stored too, or XLA copies the whole storage in every step.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from sdyn.chain import SlotRow, ValueRow
+from sdyn.chain import BaseRow, SlotRow, ValueRow
 from sdyn.materialise import keep
 from sdyn.rotation import matrix
 from sdyn.spatial import cat, cross, mm, motion_cross, mv, rigid_inertia
+from sdyn.trigonometry import sin_cos
 
 
-class Steps(NamedTuple):
-    """Operands of a sweep, one leading entry for each step."""
+def batch_of(*operands, axes: int = 1) -> tuple[int, ...]:
+    """The batch sizes of operands whose last axes are the batch, or 1 where it shares them."""
+    return np.broadcast_shapes(*(x.shape[-axes:] for x in operands))
 
-    t: jnp.ndarray
+
+# ---- the order of the bodies -----------------------------------------------------------------------------------------
+
+
+class Walk(NamedTuple):
+    """The order in which sweeps visit the bodies."""
+
     parent: jnp.ndarray
-    value: jnp.ndarray
-    sin: jnp.ndarray
-    cos: jnp.ndarray
-    q: jnp.ndarray
-    quat: jnp.ndarray | None
+    """Slot of the parent of each body [T, W]."""
+    dof: jnp.ndarray
+    live: jnp.ndarray
+    """Degree of freedom, and whether there is a body [T, W]."""
+    steps: int | jnp.ndarray
+    """How many steps to take: those that hold bodies, which is data; all, a number, where JAX transposes the sweep."""
+
+    @property
+    def width(self) -> int:
+        """Bodies in a step."""
+        return self.parent.shape[1]
+
+    @property
+    def slots(self) -> int:
+        """Slots of bodies other than the base."""
+        return self.parent.size
+
+    def outward(self, body, stored):
+        """Storage after `body(t, parents, stored) -> stored` in every step, from the base to the tips."""
+        return lax.fori_loop(0, self.steps, lambda t, x: body(t, self._parents(t), x), stored)
+
+    def inward(self, body, stored):
+        """The same, from the tips to the base."""
+        step = lambda i: self.steps - 1 - i
+        return lax.fori_loop(0, self.steps, lambda i, x: body(step(i), self._parents(step(i)), x), stored)
+
+    def _parents(self, t):
+        return keep(at(self.parent, t))
+
+    def zeros(self, components: int, B: tuple, dtype):
+        """Empty storage by slot."""
+        zero = keep(jnp.zeros((), dtype))  # one of its own: XLA would fill one storage and copy it to the others
+        return jnp.broadcast_to(zero, (self.slots + 2, components, *B))
+
+    def by_step(self, x):
+        """Values of the degrees of freedom (nv, B), laid out by slot (T, W, B), zero in empty slots."""
+        if x.shape[0] == 0:
+            return jnp.zeros((*self.live.shape, *x.shape[1:]), x.dtype)
+        return keep(jnp.take(x, self.dof, axis=0) * self._mask(x.ndim - 1).astype(x.dtype))
+
+    def dofs(self, nv: int, B: tuple, dtype):
+        """Empty storage by degree of freedom; its last row is nobody's."""
+        return jnp.zeros((nv + 1, *B), dtype)
+
+    def put_dof(self, stored, t, x):
+        """Store the values (W, B) of step t by degree of freedom; those of empty slots in the last row."""
+        for w, k in enumerate(keep(at(jnp.where(self.live, self.dof, len(stored) - 1), t))):
+            stored = lax.dynamic_update_index_in_dim(stored, x[w], k, 0, allow_negative_indices=False)
+        return stored
+
+    def _mask(self, axes: int):
+        """`live`, to broadcast against so many batch axes."""
+        return self.live.reshape(*self.live.shape, *(1,) * axes)
 
 
-def batch_of(*operands) -> int:
-    """The batch size of operands `(..., B)` or `(..., 1)`."""
-    return max(x.shape[-1] for x in operands)
+def walk_of(slot_index, whole: bool = False) -> Walk:
+    """The order of the bodies; `whole` takes all steps of the capacity."""
+    live = slot_index[SlotRow.LIVE] == 1
+    steps = live.shape[0] if whole else jnp.any(live, 1).sum(dtype=jnp.int32)
+    return Walk(slot_index[SlotRow.PARENT], slot_index[SlotRow.DOF], live, steps)
 
 
-def steps_of(slot_index, slot_value, q, quat) -> Steps:
-    """The joint constants and coordinates of each step; the sines of all joints at once."""
-    T = slot_index.shape[1]
-    qs = by_step(slot_index, q)
-    sin, cos = keep((jnp.sin(qs), jnp.cos(qs)))
-    R = None
-    if quat.shape[0]:  # rotation of the spherical joint that starts in a slot, identity elsewhere
-        one = jnp.broadcast_to(jnp.eye(3, dtype=quat.dtype)[..., None, None], (3, 3, 1, quat.shape[-1]))
-        rotations = cat([matrix(jnp.swapaxes(quat, 0, 1)), one], 2)
-        R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[SlotRow.QUAT], axis=2), 2, 0))
-    return Steps(jnp.arange(T, dtype=jnp.int32), slot_index[SlotRow.PARENT], slot_value, sin, cos, qs, R)
+def at(x, t):
+    """The entry of step t."""
+    return lax.dynamic_index_in_dim(x, t, 0, keepdims=False, allow_negative_indices=False)
 
 
-def by_step(slot_index, x):
-    """Values of the degrees of freedom (nv, B), laid out by slot (T, W, B), zero in empty slots."""
-    if x.shape[0] == 0:
-        return jnp.zeros((*slot_index.shape[1:], x.shape[-1]), x.dtype)
-    return jnp.take(x, slot_index[SlotRow.DOF], axis=0) * slot_index[SlotRow.LIVE][..., None].astype(x.dtype)
-
-
-def by_dof(slot_index, x, nv: int):
-    """The inverse of `by_step`: (T, W, B) -> (nv, B)."""
-    if nv == 0:  # the transpose of a scatter into nothing is a gather that JAX refuses
-        return jnp.zeros((0, x.shape[-1]), x.dtype)
-    live = jnp.where(slot_index[SlotRow.LIVE][..., None] == 1, x, 0)
-    return jnp.zeros((nv, x.shape[-1]), x.dtype).at[slot_index[SlotRow.DOF]].add(live)[:nv]
-
-
-def storage(slots: int, base):
-    """Storage by slot that starts with the base's value (components, B); other slots are zero."""
-    return jnp.zeros((slots + 2, *base.shape), base.dtype).at[slots].set(base)
-
-
-def take(stored, index):
-    """(slots, ..., B), (W,) -> (..., W, B): W contiguous copies, cheaper than a gather."""
-    return jnp.stack([lax.dynamic_index_in_dim(stored, i, 0, keepdims=False) for i in index], -2)
-
-
-def put(stored, t, W: int, x):
-    """Store the value of the bodies of step t."""
-    return lax.dynamic_update_slice_in_dim(stored, jnp.moveaxis(x, -2, 0), t * W, 0)
+def take(stored, slots):
+    """(slots, components, B), (W,) -> (components, W, B): W contiguous copies, cheaper than a gather."""
+    return jnp.stack([at(stored, i) for i in slots], 1)
 
 
 def block(stored, t, W: int):
     """The value stored for the bodies of step t."""
-    return jnp.moveaxis(lax.dynamic_slice_in_dim(stored, t * W, W, 0), 0, -2)
+    sizes = (W, *stored.shape[1:])
+    return jnp.moveaxis(lax.dynamic_slice(stored, _corner(stored, t * W), sizes, allow_negative_indices=False), 0, 1)
 
 
-def add_to(stored, index, x):
-    """Add to the slots named by index; one after the other, since two bodies may share a parent."""
-    for w, i in enumerate(index):
-        there = lax.dynamic_index_in_dim(stored, i, 0, keepdims=False)
-        stored = lax.dynamic_update_index_in_dim(stored, there + x[..., w, :], i, 0)
+def put(stored, t, W: int, x):
+    """Store the value of the bodies of step t."""
+    x = jnp.moveaxis(x, 1, 0)
+    return lax.dynamic_update_slice(stored, x, _corner(stored, t * W), allow_negative_indices=False)
+
+
+def put_step(x, t, value):
+    """Store the values (W, *B) of step t in (T, W, *B)."""
+    return lax.dynamic_update_index_in_dim(x, value, t, 0, allow_negative_indices=False)
+
+
+def add_to(stored, slots, x):
+    """Add to the slots named; one after the other, since two bodies may share a parent."""
+    for w, i in enumerate(slots):
+        there = at(stored, i) + x[:, w]
+        stored = lax.dynamic_update_index_in_dim(stored, there, i, 0, allow_negative_indices=False)
     return stored
 
 
-BASE_AT = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0, 0, 0, 0)  # rotation and position of the base in its own frame
+def _corner(stored, first):
+    return (first, *(jnp.zeros_like(first),) * (stored.ndim - 1))
 
 
-def poses_from(slots: int, B: int, dtype, *more):
-    """Storage of poses, and of `more` (components, B) behind them; the dummy's pose is the identity too."""
-    pose = jnp.broadcast_to(jnp.array(BASE_AT, dtype)[:, None], (12, B))
-    stored = storage(slots, cat([pose, *(jnp.broadcast_to(x, (*x.shape[:-1], B)) for x in more)]))
-    return stored.at[slots + 1, :12].set(pose)
+# ---- the bodies in the base's frame ----------------------------------------------------------------------------------
 
 
-def place(x: Steps, parent):
-    """Rotation, position and motion subspace S of the bodies of a step, from their parents' poses."""
-    c, W = x.value, x.value.shape[1]
-    Rp, pp = parent[:9].reshape(3, 3, W, -1), parent[9:12]
-    local = c[ValueRow.C0:ValueRow.C1] + c[ValueRow.C1:ValueRow.C2] * x.cos + c[ValueRow.C2:ValueRow.POINT] * x.sin
-    R = keep(mm(Rp, local.reshape(3, 3, W, -1)))
-    if x.quat is not None:
-        R = keep(mm(R, x.quat))
-    p = keep(pp + mv(Rp, c[ValueRow.POINT:ValueRow.SLIDE] + c[ValueRow.SLIDE:ValueRow.AXIS] * x.q))
-    a = mv(R, c[ValueRow.AXIS : ValueRow.AXIS + 3])
-    S = keep(cat([a, mv(R, c[ValueRow.AXIS + 3 : ValueRow.MASS]) + cross(p, a)]))
-    return R, p, S
+class Joints(NamedTuple):
+    """Of the joint of each slot, by step."""
+
+    value: jnp.ndarray
+    """Its constants, see `Chain.slot_value` [T, 52, W, B]."""
+    q: jnp.ndarray
+    sin: jnp.ndarray
+    cos: jnp.ndarray
+    """Coordinate, its sine and cosine [T, W, B]."""
+    turn: jnp.ndarray
+    offset: jnp.ndarray
+    """Rotation [T, 9, W, B] and position [T, 3, W, B] in the slot of the parent."""
+    quat: jnp.ndarray | None
+    """Rotation of the spherical joint that starts in a slot, identity elsewhere [T, 3, 3, W, B]."""
 
 
-def move(x: Steps, parent, qd):
-    """`place`, with S q̇ and the twists V = V' + S q̇."""
-    R, p, S = place(x, parent)
-    Sqd = keep(S * qd)
-    return R, p, S, Sqd, keep(parent[12:18] + Sqd)
+class Bodies(NamedTuple):
+    """Of each slot, in the base's frame and about its origin."""
+
+    S: jnp.ndarray
+    """Axis of its joint [slots + 2, 6, B]."""
+    Io: jnp.ndarray
+    h: jnp.ndarray
+    m: jnp.ndarray
+    """Rotational inertia [slots + 2, 9, B], first moment [slots + 2, 3, B] and mass [slots + 2, 1, B]."""
 
 
-def accelerated(parent, S, qdd, V, Sqd):
-    """Spatial accelerations A = A' + S q̈ + V x S q̇."""
-    return keep(parent[18:24] + S * qdd + motion_cross(V, Sqd))
+def joints_of(walk: Walk, slot_index, slot_value, q, quat) -> Joints:
+    """The joint constants and coordinates of each step; what does not depend on the parent is done at once."""
+    qs = walk.by_step(q)
+    sin, cos = keep(sin_cos(qs))
+    part = lambda first, last: slot_value[:, first:last]
+    c0, c1, c2 = (part(k, k + 9) for k in (ValueRow.C0, ValueRow.C1, ValueRow.C2))
+    turn = keep(c0 + c1 * cos[:, None] + c2 * sin[:, None])
+    offset = part(ValueRow.POINT, ValueRow.SLIDE) + part(ValueRow.SLIDE, ValueRow.AXIS) * qs[:, None]
+    R = None
+    if quat.shape[0]:
+        one = eye(quat.dtype, 1, *quat.shape[2:])
+        rotations = cat([matrix(jnp.swapaxes(quat, 0, 1)), one], 2)
+        R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[SlotRow.QUAT], axis=2), 2, 0))
+    return Joints(slot_value, qs, sin, cos, turn, offset, R)
 
 
-def wrenches_of(slot_index, F):
-    """Wrenches on the bodies of each step [T, 6, W, B], and on the base [6, 1, B]; None where F is empty."""
-    T, W = slot_index.shape[1:]
-    if not F.shape[0]:
-        return None, None
-    return F[: T * W].reshape(T, W, 6, -1).swapaxes(1, 2), F[T * W][:, None]
+def place(joints: Joints, t, Rp, pp):
+    """Rotation, position and motion subspace S of the bodies of step t, from their parents' R [3, 3, W, B] and p."""
+    axis = at(joints.value, t)[ValueRow.AXIS : ValueRow.MASS]
+    R = keep(mm(Rp, at(joints.turn, t).reshape(3, 3, *joints.turn.shape[2:])))
+    if joints.quat is not None:
+        R = keep(mm(R, at(joints.quat, t)))
+    p = keep(pp + mv(Rp, at(joints.offset, t)))
+    a = keep(mv(R, axis[:3]))
+    return R, p, cat([a, mv(R, axis[3:]) + cross(p, a)])
+
+
+def poses_from(walk: Walk, B: tuple, dtype):
+    """Storage of rotations and positions; those of the base and of the dummy are the identity."""
+    return walk.zeros(9, B, dtype).at[walk.slots :].set(eye(dtype, *B).reshape(9, *B)), walk.zeros(3, B, dtype)
+
+
+def eye(dtype, *batch):
+    """Identity matrices [3, 3, *batch]."""
+    return jnp.broadcast_to(jnp.eye(3, dtype=dtype).reshape(3, 3, *(1,) * len(batch)), (3, 3, *batch))
+
+
+def placed(walk: Walk, joints: Joints, B: tuple, each=None, more=()):
+    """Rotations and positions by slot, and the axes S.
+
+    Args:
+        walk, joints: Order and joints.
+        B: Batch size.
+        each, more: `each(t, R, p) -> values` to be kept beside them, in the storages `more`.
+    """
+    W, dtype = walk.width, joints.value.dtype
+
+    def outward(t, parents, stored):
+        Rs, ps, *_ = stored
+        Rp, pp = keep(take(Rs, parents)).reshape(3, 3, W, *B), take(ps, parents)
+        R, p, S = place(joints, t, Rp, pp)
+        values = (R.reshape(9, W, *B), p, S, *(each(t, R, p) if each else ()))
+        return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
+
+    return walk.outward(outward, (*poses_from(walk, B, dtype), walk.zeros(6, B, dtype), *more))
+
+
+def bodies_of(walk: Walk, joints: Joints, base_value, B: tuple):
+    """Rotations and positions of all slots, and their axes and inertias."""
+    W, dtype = walk.width, joints.value.dtype
+
+    def inertia(t, R, p):
+        _, h, Io = rigid_inertia(R, p, *body_of(at(joints.value, t)))
+        return Io.reshape(9, W, *B), h
+
+    R, p, S, Io, h = placed(walk, joints, B, inertia, (walk.zeros(9, B, dtype), walk.zeros(3, B, dtype)))
+    m0, h0, Io0 = base_inertia(base_value)
+    m = joints.value[:, ValueRow.MASS].reshape(walk.slots, 1, *joints.value.shape[3:])
+    m = walk.zeros(1, m.shape[2:], dtype).at[: walk.slots].set(m)
+    base = Io0.reshape(9, *Io0.shape[3:]), h0[:, 0], m0
+    Io, h, m = (x.at[walk.slots].set(y) for x, y in zip((Io, h, m), base, strict=True))
+    return R, p, Bodies(S, Io, h, m)
+
+
+def inertia_at(bodies: Bodies, t, W: int):
+    """(m, h, Io) of the bodies of step t."""
+    Io = block(bodies.Io, t, W)
+    return block(bodies.m, t, W)[0], block(bodies.h, t, W), Io.reshape(3, 3, *Io.shape[1:])
+
+
+def inertia_of_base(walk: Walk, bodies: Bodies):
+    """(m, h, Io) of the base."""
+    Io = bodies.Io[walk.slots]
+    return bodies.m[walk.slots, 0], bodies.h[walk.slots], Io.reshape(3, 3, *Io.shape[1:])
 
 
 def body_of(value):
@@ -139,12 +257,36 @@ def body_of(value):
     return m, c, I.reshape(3, 3, *value.shape[1:])
 
 
-def base_of(base_value):
-    """Mass, centre and inertia of the base, with a step's W = 1."""
-    return base_value[0][None], base_value[1:4, None], base_value[4:13].reshape(3, 3, 1, -1)
-
-
 def base_inertia(base_value):
-    """(m, h, Io) of the base about its own origin."""
-    m, c, I = base_of(base_value)
-    return rigid_inertia(jnp.eye(3, dtype=m.dtype)[..., None, None], jnp.zeros_like(c), m, c, I)
+    """(m, h, Io) of the base about its own origin, with a step's W = 1."""
+    m, c = base_value[BaseRow.MASS][None], base_value[BaseRow.COM : BaseRow.INERTIA, None]
+    I = base_value[BaseRow.INERTIA : BaseRow.FREE].reshape(3, 3, 1, *base_value.shape[1:])
+    return rigid_inertia(eye(m.dtype, 1, *(1,) * (base_value.ndim - 1)), jnp.zeros_like(c), m, c, I)
+
+
+# ---- their motion ----------------------------------------------------------------------------------------------------
+
+
+def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=()):
+    """Twists V = V' + S q̇ and spatial accelerations A = A' + S q̈ + V x S q̇ of all slots [slots + 2, 6, B].
+
+    Args:
+        walk, S: Order and axes.
+        V0, A0: Of the base [6, B].
+        qd, qdd: By step [T, W, B]; without `qdd`, at zero accelerations.
+        B: Batch size.
+        each, more: `each(t, V, A) -> values` to be kept beside them, in the storages `more`.
+    """
+    W = walk.width
+
+    def outward(t, parents, stored):
+        s = block(S, t, W)
+        Sqd = keep(s * at(qd, t))
+        V = keep(take(stored[0], parents) + Sqd)
+        A = take(stored[1], parents) + keep(motion_cross(V, Sqd))
+        A = keep(A if qdd is None else A + s * at(qdd, t))
+        values = (V, A, *(each(t, V, A) if each else ()))
+        return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
+
+    start = (walk.zeros(6, B, S.dtype).at[walk.slots].set(x) for x in (V0, A0))
+    return walk.outward(outward, (*start, *more))

@@ -78,12 +78,27 @@ def directions(name, rng) -> list[Arguments]:
             y = (y + y.swapaxes(-1, -2)) * np.trace(np.asarray(x.inertia), axis1=-2, axis2=-1)[..., None, None]
         if key == "mass":
             y = y * np.asarray(x.mass)
-        if key in ("com", "joints"):
+        if key == "com":
             y = y * 0.1
+        if key == "joints":
+            y = 0.1 * along_joints(np.asarray(x.joints), y)
         if key == "passive":
             y = y * 0.01  # the smallest inertia in the table is 1e-3
         out.append(Arguments(*(y if i == k else np.zeros_like(z) for i, z in enumerate(x))))
     assert chain.nv == real(mine).size
+    return out
+
+
+def along_joints(joints, y):
+    """The directions, made such that rotations, axes and lock quaternions keep their lengths: in others the derivative
+    of a rotation matrix means nothing, and that of the chain leaves them out."""
+    out = y.copy()
+    R = joints[..., :9].reshape(*joints.shape[:-1], 3, 3)
+    out[..., :9] = np.cross(y[..., None, :3], R, axis=-1).reshape(out[..., :9].shape)
+    for k in (12, 18, 24):
+        out[..., k : k + 3] = np.cross(joints[..., k : k + 3], y[..., k : k + 3])
+    quat = joints[..., 33:37]
+    out[..., 33:37] = y[..., 33:37] - (quat * y[..., 33:37]).sum(-1, keepdims=True) * quat
     return out
 
 

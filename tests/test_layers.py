@@ -22,9 +22,9 @@ HOST = [
 ]
 DEVICE = [
     ["chain", "materialise", "batching", "semidefinite"],
-    ["merge", "spatial", "rotation"],
+    ["merge", "spatial", "rotation", "trigonometry"],
     ["pack", "sweep", "inputs", "coordinates"],
-    ["rnea", "crba", "aba"],
+    ["rnea", "rnea_motion", "rnea_tangent", "rnea_adjoint", "rnea_derivatives", "crba", "aba"],
     ["kinematics"],
     ["dynamics", "closures", "delassus", "partition", "constraints", "drift"],
     ["momentum", "params", "floating", "actuators"],
