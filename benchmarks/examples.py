@@ -25,8 +25,8 @@ class Model(NamedTuple):
     tau: np.ndarray
     f: Callable
     """(chain, q, v, tau) -> vdot, all of it."""
-    shared: np.ndarray
-    """Which entries of vdot are compared."""
+    shared: np.ndarray | None
+    """Which entries of vdot are compared; None where the model is here for its cost only."""
 
     @property
     def size(self) -> str:
@@ -119,7 +119,7 @@ def steps_2(q=None) -> dict[str, sdyn.Robot]:
 
 
 def example_2() -> dict[str, Model]:
-    """Each step of the restructuring, and the last state with the connectivity kept: a free base and three closures."""
+    """The last step of the restructuring, against the connectivity kept: a free base and three closures."""
     rng = np.random.default_rng(2)
     free = steps_2()["free, three arms"]
     names = [joint.name for joint in free.moving]
@@ -129,18 +129,20 @@ def example_2() -> dict[str, Model]:
     kept = free.close("hand2", "hand1", q=q).close("hand1", "ground", name="held", q=q)
     robots = steps_2(q) | {"connectivity kept, three closures": kept.close("hand3", "ground", q=q)}
 
-    size, out = sdyn.capacity(robots.values()), {}
-    transfer = jax.jit(sdyn.transfer, **QUICKLY)  # one program for all steps
-    chain = sdyn.pack(free, size)
-    q, v = sdyn.pad(chain, q, v)
-    for step, robot in robots.items():
-        if out:
-            chain, q, v, _ = transfer(chain, sdyn.pack(robot, size), q, v)
+    def model(robot, q, v):
         at, tau = joints_of(robot, names), np.zeros(robot.nv)
         tau[at] = [torques[name] for name in names]
-        state = map(np.asarray, sdyn.unpad(chain, q, v))
-        out[step] = Model(sdyn.pack(robot), *state, tau, sdyn.forward_dynamics, at)
-    return out
+        return Model(sdyn.pack(robot), np.asarray(q), np.asarray(v), tau, sdyn.forward_dynamics, at)
+
+    size = sdyn.capacity(robots.values())
+    transfer = jax.jit(sdyn.transfer, **QUICKLY)  # the state goes from one to the next, by one program
+    chain, out = sdyn.pack(free, size), {}
+    q, v = sdyn.pad(chain, q, v)
+    for step, robot in list(robots.items())[1:]:
+        chain, q, v, _ = transfer(chain, sdyn.pack(robot, size), q, v)
+        out[step] = model(robot, *sdyn.unpad(chain, q, v))
+    *_, last, kept = out.values()
+    return {"restructured, two closures": last, "connectivity kept, three closures": kept}
 
 
 # -- example 3: of 37 degrees of freedom, 9 move -----------------------------------------------------------------------
@@ -183,6 +185,7 @@ def example_3() -> dict[str, Model]:
         "restructured, 9 DOF": Model(sdyn.pack(small), q9, v9, torque, sdyn.forward_dynamics, np.arange(9)),
         "37 DOF, idle joints held by multipliers": Model(chain, q, v, tau, multipliers, at),
         "37 DOF, idle joints eliminated from M": Model(chain, q, v, tau, eliminated, at),
+        "37 DOF, nothing held (other accelerations)": Model(chain, q, v, tau, sdyn.forward_dynamics, None),
     }
 
 

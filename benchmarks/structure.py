@@ -1,9 +1,9 @@
-"""The paper's three examples: restructured models against those that keep the structure, and what restructuring costs.
+"""The paper's three examples: restructured models against those that keep the structure and constrain it.
 
     python benchmarks/structure.py
 
-Agreement of the accelerations first, then time per sample, one at a time and in batches, on one core; then the edit.
-results/structure.json.
+Agreement of the accelerations first, then time per sample, one at a time and in batches, on one core; what an edit
+costs is in structure_change.py. results/structure.json.
 """
 
 import harness
@@ -18,10 +18,10 @@ def one_example(models) -> list[dict]:
 
     want, rows, single, many = None, [], {}, {}
     for name, m in models.items():
-        vdot = m.accelerations()
-        want = vdot if want is None else want
         rows.append(dict(model=name, coordinates_and_rows=m.size))
-        if np.shape(vdot) == np.shape(want):
+        if m.shared is not None:
+            vdot = m.accelerations()
+            want = vdot if want is None else want
             rows[-1]["disagreement"] = float(np.abs(vdot - want).max() / np.abs(want).max())
         f, state = m.f, (m.q, m.v, m.tau)
         batched, wide = jax.vmap(f, (None, 0, 0, 0)), tuple(np.tile(x, (BATCH, 1)) for x in state)
@@ -33,32 +33,6 @@ def one_example(models) -> list[dict]:
             row[key] = harness.spread(times[row["model"]])
             row[f"{key}_ratio"] = harness.ratio(times[row["model"]], times[rows[0]["model"]])
     return rows
-
-
-def edits() -> dict[str, dict]:
-    """Edit and pack, for each example's change of structure, within one capacity [us]."""
-    import examples
-    import jax
-    import numpy as np
-
-    import sdyn
-
-    full = sdyn.models.load("paper37")
-    idle = {joint.name: 0.3 for joint in full.moving if joint.name not in examples.ACTIVE}
-    _, robot = examples.flyer()
-    free, *_ = examples.steps_2().values()
-    hand = free.frame("hand1").link
-    changes = {
-        "Example 1": (robot, lambda: robot.reroot("fixture").ground("grip")),
-        "Example 2": (free, lambda: free.close("hand2", "hand1").reroot(hand).ground("hand1").close("hand3", "ground")),
-        "Example 3": (full, lambda: full.lock(idle)),
-    }
-    out = {}
-    for name, (before, edit) in changes.items():
-        size = sdyn.capacity([before, edit()])
-        f = harness.calls(lambda edit=edit, size=size: jax.block_until_ready(sdyn.pack(edit(), size)))
-        out[name] = harness.spread(np.array([harness.seconds(f, 1) for _ in range(100)]))
-    return out
 
 
 def main():
@@ -75,11 +49,8 @@ def main():
                 f"  {row['model']:42s} {row['coordinates_and_rows']:>8s}"
                 f"  {single:9.1f} us ({row['single_ratio']:5.2f} x)"
                 f"  batch {many:8.2f} us ({row[f'batch_{BATCH}_ratio']:5.2f} x)"
-                f"  {row.get('disagreement', 0):.0e}"
+                f"  {'' if 'disagreement' not in row else format(row['disagreement'], '.0e')}"
             )
-    out["edit_and_pack"] = edits()
-    for name, row in out["edit_and_pack"].items():
-        print(f"  {name}: edit and pack {row['median_us'] / 1e3:.2f} ms")
     harness.save("structure", out)
 
 
