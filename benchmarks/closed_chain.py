@@ -71,16 +71,13 @@ def main():
     robot, chain, q, v, tau = closed_states(COUNT)
     w = np.random.default_rng(1).normal(size=20)
     residual = jax.jit(jax.vmap(sdyn.loop_residual, (None, 0)))(chain, q)
-    ours = jax.vmap(lambda q, v, tau: sdyn.forward_dynamics(chain, q, v, tau))
-
-    def slope(q, v, tau):
-        """The gradient with respect to the torques, with that to the state added so that it is not left out."""
-        g = jax.grad(lambda q, v, tau: w @ sdyn.forward_dynamics(chain, q, v, tau), (0, 1, 2))(q, v, tau)
-        return g[0][:20] + g[1] + g[2] + g[0][20]
-
+    held = sdyn.forward_dynamics
+    ours = lambda chain, x: jax.vmap(held, (None, 0, 0, 0))(chain, *x)
+    along = jax.grad(lambda x, chain, w: w @ held(chain, *x))
+    slope = lambda fixed, x: jax.vmap(along, (0, None, None))(x, *fixed)
     pin = Pinocchio(robot, q, v, tau)
     want = pin.vdot()
-    error = float(np.abs(jax.jit(ours)(q, v, tau) - want).max() / np.abs(want).max())
+    error = float(np.abs(jax.jit(ours)(chain, (q, v, tau)) - want).max() / np.abs(want).max())
     print(f"closures {np.abs(residual).max():.1e}, accelerations differ by {error:.1e}")
 
     def every(f):
@@ -92,9 +89,9 @@ def main():
         return run
 
     contenders = {
-        "sdyn accelerations": harness.Contender(harness.loop(ours, q, v, tau, carry=2), COUNT),
+        "sdyn accelerations": harness.Contender(harness.loop(ours, chain, (q, v, tau)), COUNT),
         "Pinocchio accelerations": harness.Contender(every(pin.acceleration), COUNT),
-        "sdyn gradient": harness.Contender(harness.loop(jax.vmap(slope), q, v, tau, carry=2), COUNT),
+        "sdyn gradient": harness.Contender(harness.loop(slope, (chain, w), (q, v, tau)), COUNT),
         "Pinocchio gradient": harness.Contender(every(pin.gradient), COUNT),
     }
     times, first = harness.times(contenders)

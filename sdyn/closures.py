@@ -17,7 +17,9 @@ from jaxtyping import Array, Float
 from sdyn.chain import Chain, ClosureRow, LinkRow, LoopRow
 from sdyn.coordinates import pose_of
 from sdyn.inputs import expect
-from sdyn.kinematics import jacobian_columns, link_motions, link_poses, poses
+from sdyn.kinematics import jacobian_columns, link_poses, poses, slot_motions
+
+IDENTITY = (1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0, 0, 0, 0)  # rotation and position of a frame that is its link's own
 
 
 class Ends(NamedTuple):
@@ -43,7 +45,7 @@ def loop_residual(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, " nc"]:
     (q,) = expect(chain, q=q)
     pose = pose_of(chain, q)
     slots, _ = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
-    return residual_of(chain, ends_of(chain, pose, *link_poses(chain, slots[..., 0])))
+    return residual_of(chain, ends_of(chain, pose, slots[..., 0]))
 
 
 def loop_jacobian(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "nc nv"]:
@@ -62,10 +64,9 @@ def closure_parts(chain: Chain, q):
     """K, the squared length of the twists that each row picks a component of, and the residual."""
     pose = pose_of(chain, q)
     slots, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
-    ends = ends_of(chain, pose, *link_poses(chain, slots[..., 0]))
-    slot = jnp.append(chain.link_index[LinkRow.SLOT], chain.capacity.slots + 1)  # the ground does not move
-    columns = lambda end: jacobian_columns(chain, pose, S[..., 0], slot[chain.loop_index[end]])
-    D = columns(LoopRow.A) - columns(LoopRow.B)
+    ends = ends_of(chain, pose, slots[..., 0])
+    Ja, Jb = (jacobian_columns(chain, pose, S[..., 0], slot) for slot in end_slots(chain))
+    D = Ja - Jb
     K = jnp.einsum("rk,rkv->rv", basis(chain, ends), D[chain.row_index[ClosureRow.LOOP]])
     linear = D[:, 3:] + jnp.cross(D[:, :3], ends.xa[:, :, None], axis=1)
     turn, slide = ((x * x).sum((1, 2))[:, None] for x in (D[:, :3], linear))
@@ -75,10 +76,24 @@ def closure_parts(chain: Chain, q):
 
 def closure_acceleration(chain: Chain, q, v, vdot):
     """K v̇ − k [nc]."""
+    return _acceleration(chain, *_end_motions(chain, q, v, vdot))
+
+
+def closure_forces(chain: Chain, q, v, vdot, lam):
+    """Wrenches on the slots [slots + 2, 6], base axes and origin, and K v̇ − k, from one sweep."""
+    ends, slots = _end_motions(chain, q, v, vdot)
+    return at_slots(chain, wrenches(chain, ends, lam)), _acceleration(chain, ends, slots)
+
+
+def _end_motions(chain, q, v, vdot):
+    """The frames, and poses, twists and spatial accelerations of the slots."""
     pose = pose_of(chain, q)
-    R, p, V, A = link_motions(chain, pose, v, vdot)
-    ends = ends_of(chain, pose, R, p)
-    (Va, Vb), (Aa, Ab) = (_at_ends(chain, x) for x in (V, A))
+    slots = slot_motions(chain, pose, v, vdot)
+    return ends_of(chain, pose, slots), slots
+
+
+def _acceleration(chain, ends, slots):
+    Va, Vb, Aa, Ab = (slots[slot, k : k + 6] for k in (12, 18) for slot in end_slots(chain))
     D = Aa - Ab + _motion_cross(Va, Vb)
     rows = chain.row_index[ClosureRow.LOOP]
     return (basis(chain, ends) * D[rows]).sum(1) - _turning(chain, ends, Vb[:, :3] - Va[:, :3])
@@ -95,8 +110,8 @@ def loop_wrenches(chain: Chain, q: Float[Array, " nq"], lam: Float[Array, " nc"]
     (q,) = expect(chain, q=q)
     pose = pose_of(chain, q)
     slots, _ = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
-    R, p = link_poses(chain, slots[..., 0])
-    F = at_links(chain, wrenches(chain, ends_of(chain, pose, R, p), lam))
+    _, p = link_poses(chain, slots[..., 0])
+    F = at_links(chain, wrenches(chain, ends_of(chain, pose, slots[..., 0]), lam))
     return jnp.concatenate([(F[:, :3] - jnp.cross(p, F[:, 3:])) @ pose.R.T, F[:, 3:] @ pose.R.T], 1)
 
 
@@ -106,20 +121,40 @@ def at_links(chain: Chain, F):
     return jnp.zeros((chain.capacity.links, 6), F.dtype).at[a].add(F, mode="drop").at[b].add(-F, mode="drop")
 
 
+def at_slots(chain: Chain, F):
+    """The same for the slots [slots + 2, 6]; what the ground gets, the dummy has."""
+    a, b = end_slots(chain)
+    return jnp.zeros((chain.capacity.slots + 2, 6), F.dtype).at[a].add(F).at[b].add(-F)
+
+
+def end_slots(chain: Chain):
+    """Slots of the links a and b of each loop; the dummy for the ground."""
+    slot = jnp.append(chain.link_index[LinkRow.SLOT], chain.capacity.slots + 1)
+    return slot[chain.loop_index[LoopRow.A]], slot[chain.loop_index[LoopRow.B]]
+
+
 def wrenches(chain: Chain, ends: Ends, lam):
     """Wrench on link a of each loop, base axes and origin [loops, 6]."""
     of_rows = basis(chain, ends) * lam[:, None]
     return jnp.zeros((chain.capacity.loops, 6), lam.dtype).at[chain.row_index[ClosureRow.LOOP]].add(of_rows)
 
 
-def ends_of(chain: Chain, pose, R, p) -> Ends:
-    """The frames of the loops, from the poses of the links in base axes; the ground is the link behind the last."""
-    R, p = jnp.concatenate([R, pose.R.T[None]]), jnp.concatenate([p, -(pose.p @ pose.R)[None]])
-    out = []
-    for end, first in ((LoopRow.A, 0), (LoopRow.B, 12)):
+def ends_of(chain: Chain, pose, slots) -> Ends:
+    """The frames of the loops, from the poses of the slots [slots + 2, 12 or more]."""
+    out, still = [], jnp.concatenate([pose.R.T.reshape(9), -pose.p @ pose.R])  # the ground, seen from the base
+    own = jnp.concatenate([chain.link_pose, jnp.asarray([IDENTITY], pose.R.dtype)])
+    for end, slot, first in zip((LoopRow.A, LoopRow.B), end_slots(chain), (0, 12), strict=True):
         link, value = chain.loop_index[end], chain.loop_value[:, first : first + 12]
-        out += [R[link] @ value[:, :9].reshape(-1, 3, 3), p[link] + (R[link] @ value[:, 9:, None])[..., 0]]
+        at = jnp.where((link == chain.capacity.links)[:, None], still, slots[slot, :12])
+        R, p = _composed(at, own[link])
+        out += _composed(jnp.concatenate([R.reshape(-1, 9), p], 1), value)
     return Ends(*out)
+
+
+def _composed(outer, inner):
+    """Rotation and position of poses [loops, 12] in one another."""
+    (R, p), (S, x) = ((y[:, :9].reshape(-1, 3, 3), y[:, 9:]) for y in (outer, inner))
+    return R @ S, p + (R @ x[..., None])[..., 0]
 
 
 def basis(chain: Chain, ends: Ends):
@@ -159,12 +194,6 @@ def _turning(chain, ends, spin):
     z, x = ends.Ra[:, :, 2], ends.Rb[:, :, 0]
     turning = (jnp.cross(z, jnp.cross(spin, x)) * spin).sum(1)
     return _rows(chain, jnp.concatenate([jnp.zeros((len(z), 6), z.dtype), turning[:, None]], 1))
-
-
-def _at_ends(chain, V):
-    """Values of the links [n, 6] at the loops' ends a and b; zero for the ground."""
-    V = jnp.concatenate([V, jnp.zeros((1, 6), V.dtype)])
-    return V[chain.loop_index[LoopRow.A]], V[chain.loop_index[LoopRow.B]]
 
 
 def _motion_cross(V, m):

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sdyn.chain import Chain, ClosureRow
-from sdyn.closures import closure_acceleration, loop_jacobian, loop_residual, loop_wrenches
+from sdyn.closures import closure_acceleration, closure_forces, loop_jacobian, loop_residual
 from sdyn.delassus import delassus
 from sdyn.delassus import solve as delassus_solve
-from sdyn.dynamics import inverse_dynamics, tree_dynamics
+from sdyn.dynamics import inverse_dynamics, inverse_dynamics_under, tree_dynamics
 from sdyn.inputs import expect
 from sdyn.partition import Partition, condition, partition
 from sdyn.partition import solve as partition_solve
@@ -206,10 +206,10 @@ def _opening(chain, q, v, vdot, rate):
 
 
 def _residual(chain, q, v, tau, gravity, f_ext, baumgarte, vdot, lam):
-    F = loop_wrenches(chain, q, lam)
-    F = F if f_ext is None else F + f_ext
-    force = inverse_dynamics(chain, q, v, vdot, gravity=gravity, f_ext=F)
-    return force - tau, _opening(chain, q, v, vdot, baumgarte)
+    F, opening = closure_forces(chain, q, v, vdot, lam)
+    if baumgarte is not None:
+        opening = _opening(chain, q, v, vdot, baumgarte)
+    return inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, F) - tau, opening
 
 
 def _slope(function, primals, tangents):

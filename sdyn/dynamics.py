@@ -56,7 +56,14 @@ def inverse_dynamics(
         Featherstone (2008), chapter 5.
     """
     q, v, vdot, gravity, f_ext = expect(chain, q=q, v=v, vdot=vdot, gravity=gravity, f_ext=f_ext)
+    return inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext)
+
+
+def inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, on_slots=None):
+    """`inverse_dynamics` under wrenches on the slots too, base axes and origin [slots + 2, 6]."""
     pose, structure, G, F = _operands(chain, q, gravity, f_ext)
+    if on_slots is not None:
+        F = on_slots[..., None] if f_ext is None else F + on_slots[..., None]
     V0, qd = rates_of(chain, pose, v)
     a0, qdd = rates_of(chain, pose, vdot)
     f0, tau = rnea(*structure, V0, qd, a0, qdd - spin(chain, qd), G, F)

@@ -36,14 +36,19 @@ poses = Kernel(_poses)
 motions = Kernel(_motions)
 
 
-def link_motions(chain: Chain, pose: Pose, v, vdot):
-    """Rotation [n, 3, 3], origin [n, 3], twist and spatial acceleration [n, 6] of every link, in base axes."""
+def slot_motions(chain: Chain, pose: Pose, v, vdot):
+    """Rotation, position, twist and spatial acceleration of every slot [slots + 2, 24], in base axes."""
     value = chain.slot_value[..., None]
     V0, qd = rates_of(chain, pose, v)
     a0, qdd = rates_of(chain, pose, vdot)
     free = chain.base_value[BaseRow.FREE]
     (slots,) = motions(chain.slot_index, value, pose.q, pose.quat, V0 * free, qd, a0 * free, qdd - spin(chain, qd))
-    slots = slots[..., 0]
+    return slots[..., 0]
+
+
+def link_motions(chain: Chain, pose: Pose, v, vdot):
+    """Rotation [n, 3, 3], origin [n, 3], twist and spatial acceleration [n, 6] of every link, in base axes."""
+    slots = slot_motions(chain, pose, v, vdot)
     return *link_poses(chain, slots), *(slots[chain.link_index[LinkRow.SLOT], k : k + 6] for k in (12, 18))
 
 

@@ -224,7 +224,7 @@ def _jump(chain, q, v0, R, p, V, held, restitution):
     V = jnp.concatenate([w @ pose.R, u @ pose.R], 1)
     present = (index[LinkRow.SLOT] <= chain.capacity.slots)[:, None]
     Rb, pb, V0, _ = link_motions(chain, pose, v0, jnp.zeros_like(v0))
-    _, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
+    slots, S = poses(chain.slot_index, chain.slot_value[..., None], pose.q, pose.quat)
     J = jacobian_columns(chain, pose, S[..., 0], index[LinkRow.SLOT])
     h = jnp.where(present, link_momenta(chain, Rb, pb, V - V0), 0)
     dv = solve_mass(chain, q, jnp.einsum("nkv,nk->v", J, h))
@@ -232,7 +232,7 @@ def _jump(chain, q, v0, R, p, V, held, restitution):
     of_loops = jnp.zeros((0, 6), q.dtype)
     if chain.capacity.rows:
         more, lam = _stop(chain, q, v0 + dv, held, restitution)
-        ends, dv = ends_of(chain, pose, Rb, pb), dv + more
+        ends, dv = ends_of(chain, pose, slots[..., 0]), dv + more
         F = wrenches(chain, ends, lam)
         h, of_loops = h + at_links(chain, F), about(F, ends.xa)
     dh = jnp.where(present, link_momenta(chain, Rb, pb, jnp.einsum("nkv,v->nk", J, dv)), 0) - h
