@@ -17,7 +17,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 # What takes longest comes first, so that two workers end together; files stay whole, their tests share programs.
-LONGEST = ("test_grasp.py", "test_gradients.py", "test_transfer.py", "test_laws.py", "test_floating.py")
+LONGEST = ("test_grasp.py", "test_gradients.py", "test_transfer.py", "test_laws.py", "test_floating_motion.py")
 
 
 def pytest_xdist_auto_num_workers(config):
