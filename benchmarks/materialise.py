@@ -11,7 +11,7 @@ from types import ModuleType
 
 import harness
 
-LEAST = 2.0  # times faster; measured 5 to 10, and 1 where JAX drops the barriers (before 0.12)
+LEAST = 2.0  # times faster; measured 4 to 9, and 1 where JAX drops the barriers (before 0.12)
 BATCH = 256
 
 
