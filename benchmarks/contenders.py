@@ -45,6 +45,17 @@ def jacobians(robot, batch: int, by=jax.jacrev) -> Contender:
     return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
 
 
+def columns(robot, batch: int) -> Contender:
+    """The same, by `sdyn.forward_dynamics_jacobians`."""
+
+    def f(chain, x):
+        _, *slopes = jax.vmap(sdyn.forward_dynamics_jacobians, (None, 0, 0, 0))(chain, *x)
+        of_q, of_v, of_tau = (J.sum(1) for J in slopes)
+        return jnp.pad(of_q, ((0, 0), (1, 0))), of_v, of_tau
+
+    return Contender(loop(f, sdyn.pack(robot), peers.states(robot, batch)), batch)
+
+
 def pinocchio(peer) -> dict[str, Contender]:
     """ABA in both of its conventions, and its derivatives."""
     pin, model, data = peer.pin, peer.model, peer.data

@@ -82,6 +82,7 @@ def of_full(full, reduced):
         "sdyn, gradient, batch 256": contenders.gradient(full, 256),
         "sdyn, jacrev, batch 64": contenders.jacobians(full, 64, jax.jacrev),
         "sdyn, jacfwd, batch 64": contenders.jacobians(full, 64, jax.jacfwd),
+        "sdyn, all Jacobians, batch 64": contenders.columns(full, 64),
         "9-DOF form": contenders.forward(reduced, 256),
         PADDED: contenders.forward(reduced, 256, capacity=sdyn.capacity([full, reduced])),
     }
@@ -93,7 +94,7 @@ def ratios(times) -> list[dict]:
     best = lambda names: min((name for name in names if name in times), key=median, default="")
     aba = best(["pin.aba", "pin.aba (world)"])
     one = best([f"sdyn, batch 1, width {w}" for w in WIDTHS])
-    all_slopes = best(["sdyn, jacrev, batch 64", "sdyn, jacfwd, batch 64"])
+    all_slopes = best(["sdyn, all Jacobians, batch 64", "sdyn, jacrev, batch 64", "sdyn, jacfwd, batch 64"])
     rows = [
         ("forward dynamics, batch 256", aba, "sdyn, batch 256"),
         ("forward dynamics, batch 256, float32", aba, "sdyn float32, batch 256"),

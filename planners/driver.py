@@ -8,7 +8,6 @@ from importlib.metadata import version
 
 import jax
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from planners import sqp
 from planners.certify import certify
@@ -42,6 +41,8 @@ def plan(
     fine = _checked(solver, seeds, accuracy)
     from planners.progress import Live
 
+    from threadpoolctl import threadpool_limits  # importing it sets an environment variable
+
     module = importlib.import_module(f"planners.{task.kind}")
     began = time.monotonic()
     with Live(task.name, seeds, show=progress, iterations=ITERATIONS, tolerance=sqp.FEASIBLE) as live:
@@ -52,7 +53,7 @@ def plan(
         live.compiling("the problem and the solver")
         sqp.compile_all(problem, seeds)
         history = []
-        # matrices of a few hundred rows: two threads of BLAS are no faster, and ten times slower where others compute
+        # matrices of a few hundred rows: two threads of BLAS take twice the time of one, and far more on a busy machine
         with threadpool_limits(1, "blas"):
             for state in sqp.solve(problem, z, iterations=ITERATIONS):
                 best = sqp.pick(state, sqp.ranking(state)[0])

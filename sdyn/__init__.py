@@ -19,6 +19,7 @@ from sdyn.kinematics import body_poses, frame_acceleration, frame_jacobian, fram
 from sdyn.dynamics import bias_force, inverse_dynamics, mass_matrix, solve_mass
 from sdyn.closures import loop_jacobian, loop_residual, loop_wrenches
 from sdyn.constraints import Status, constrained_dynamics, constrained_inverse_dynamics, forward_dynamics
+from sdyn.jacobians import forward_dynamics_jacobians
 from sdyn.partition import Partition, partition
 from sdyn.drift import project
 from sdyn.momentum import centre_of_mass, kinetic_energy, momentum

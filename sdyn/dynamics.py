@@ -31,10 +31,10 @@ def tree_dynamics(
         Featherstone (2008), section 7.3; derivatives by the implicit rule, see `aba.py`.
     """
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    pose, structure, G, F = _operands(chain, q, gravity, f_ext)
+    pose, structure, G, F = operands_of(chain, q, gravity, f_ext)
     V0, qd = rates_of(chain, pose, v)
     f0, force = rates_of(chain, pose, tau)
-    a0, qdd = _aba.aba(*structure, V0, qd, f0, force - _passive(chain, pose, qd), G, F)
+    a0, qdd = _aba.aba(*structure, V0, qd, f0, force - passive_force(chain, pose, qd), G, F)
     return join(chain, pose, a0, qdd + spin(chain, qd))
 
 
@@ -61,13 +61,13 @@ def inverse_dynamics(
 
 def inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, on_slots=None):
     """`inverse_dynamics` under wrenches on the slots too, base axes and origin [slots + 2, 6]."""
-    pose, structure, G, F = _operands(chain, q, gravity, f_ext)
+    pose, structure, G, F = operands_of(chain, q, gravity, f_ext)
     if on_slots is not None:
         F = on_slots[..., None] if f_ext is None else F + on_slots[..., None]
     V0, qd = rates_of(chain, pose, v)
     a0, qdd = rates_of(chain, pose, vdot)
     f0, tau = rnea(*structure, V0, qd, a0, qdd - spin(chain, qd), G, F)
-    return join(chain, pose, f0, tau + _passive(chain, pose, qd))
+    return join(chain, pose, f0, tau + passive_force(chain, pose, qd))
 
 
 def bias_force(
@@ -85,7 +85,7 @@ def mass_matrix(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
         Featherstone (2008), section 6.2.
     """
     (q,) = expect(chain, q=q)
-    pose, (index, *rest), _, _ = _operands(chain, q, None, None)
+    pose, (index, *rest), _, _ = operands_of(chain, q, None, None)
     (M,) = crba(index, chain.ancestors, *rest)
     M, nb = M[..., 0], chain.capacity.base_nv
     if chain.capacity.quaternions:
@@ -103,12 +103,12 @@ def solve_mass(chain: Chain, q: Float[Array, " nq"], b: Float[Array, " nv"]) -> 
         b: Right-hand side, laid out as v.
     """
     q, b = expect(chain, q=q, b=b)
-    pose, structure, _, _ = _operands(chain, q, None, None)
+    pose, structure, _, _ = operands_of(chain, q, None, None)
     left = _aba.nothing_saved(chain.dtype)
     return join(chain, pose, *_aba.mass_solve(*structure, *left, *rates_of(chain, pose, b)))
 
 
-def _operands(chain, q, gravity, f_ext):
+def operands_of(chain, q, gravity, f_ext):
     """Pose, the operands that all kernels start with, gravity and wrenches."""
     pose = pose_of(chain, q)
     value, base, rotor = chain.slot_value[..., None], chain.base_value[:, None], chain.dof_value[2][:, None]
@@ -126,7 +126,7 @@ def _wrenches(chain, pose, f_ext):
     return jnp.zeros((slots.shape[0], 6), F.dtype).at[chain.link_index[LinkRow.SLOT]].add(F)[..., None]
 
 
-def _passive(chain, pose, qd):
+def passive_force(chain, pose, qd):
     """Force that damping and stiffness ask for."""
     damping, stiffness, _ = chain.dof_value[..., None]
     return damping * qd + stiffness * pose.q

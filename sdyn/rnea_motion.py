@@ -51,9 +51,9 @@ def flat(bodies: Bodies):
     return cat([*bodies[:3], jnp.broadcast_to(bodies.m, bodies.S[:, :1].shape)], 1)
 
 
-def motion_of(x: dict, geometry: bool, whole: bool) -> Motion:
-    """What follows from the operands x, by name; with the joints' frames if `geometry` is asked for."""
-    B = batch_of(*(x[k] for k in OPERANDS[1:12]), axes=2)
+def motion_of(x: dict, geometry: bool, whole: bool, axes: int = 2) -> Motion:
+    """What follows from the operands x, by name, with so many batch axes; the joints' frames if `geometry`."""
+    B = batch_of(*(x[k] for k in OPERANDS[1:12]), axes=axes)
     walk, free, joints, R, p = walk_of(x["slot_index"], whole), x["base_value"][BaseRow.FREE], None, None, None
     if geometry or x["saved"].shape[0] == 0:
         joints = joints_of(walk, x["slot_index"], x["slot_value"], x["q"], x["quat"])

@@ -21,6 +21,7 @@ SIGNATURES = {
     "pad": ("chain q v", ""),
     "unpad": ("chain q v", ""),
     "forward_dynamics": ("chain q v tau", "gravity f_ext"),
+    "forward_dynamics_jacobians": ("chain q v tau", "gravity"),
     "inverse_dynamics": ("chain q v vdot", "gravity f_ext"),
     "constrained_dynamics": ("chain q v tau", "gravity f_ext method"),
     "loop_residual": ("chain q", ""),

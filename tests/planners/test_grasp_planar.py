@@ -18,7 +18,7 @@ def test_it_is_planned_and_certified(plan):
     assert plan.status == "solved", plan.verdict
     assert plan.certificate.passed, str(plan.certificate)
     assert plan.phases[0].robot.nv == 9
-    assert len(plan.history) < 80  # measured 39
+    assert len(plan.history) < 80  # measured 33
 
 
 def test_the_same_plan_twice_is_identical(plan):

@@ -131,7 +131,7 @@ def test_several_starts_are_solved_as_each_alone():
     for k, z in enumerate(STARTS):
         alone, state = last(VALLEYS, z), sqp.pick(together, k)
         assert said(state) == said(alone) == "solved"
-        assert np.allclose(state.z, alone.z, atol=1e-6)  # measured: identical
+        assert np.allclose(state.z, alone.z, atol=1e-6)  # measured 3.5e-18
         ended = [s for s in states if s.status[k] != sqp.RUNNING]
         assert all(np.array_equal(sqp.pick(s, k).z, state.z) for s in ended)  # what has ended waits
     assert sqp.running(states[0]) == 4 and sqp.running(together) == 0
