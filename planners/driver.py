@@ -39,9 +39,9 @@ def plan(
         TaskError: If an argument is none of these, or float64 is off.
     """
     fine = _checked(solver, seeds, accuracy)
-    from planners.progress import Live
-
     from threadpoolctl import threadpool_limits  # importing it sets an environment variable
+
+    from planners.progress import Live
 
     module = importlib.import_module(f"planners.{task.kind}")
     began = time.monotonic()
