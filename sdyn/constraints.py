@@ -110,7 +110,8 @@ def constrained_dynamics(
     Returns:
         vdot: As of `forward_dynamics`.
         lam: One entry per row of the closures, the wrench on frame a in the axes and at the origin of frame a [N m,
-            N]; where it is not unique, the one with the least sum of squares.
+            N]; where it is not unique, the one with the least sum of squares. Its derivative is exact where the
+            redundancy does not turn with q, as with a closure stated twice; vdot and its derivative always are.
         status: See `Status`.
 
     Source:
