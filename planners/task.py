@@ -16,18 +16,24 @@ import sdyn
 
 FOLDER = Path(__file__).parent / "tasks"
 LARGEST_FILE = 1 << 20  # bytes
+LARGEST = 1e30  # of the numbers in a task; their products stay within float64
 
 
 class TaskError(ValueError):
     """A task that cannot be what it says; the message names the key and the remedy."""
 
 
+def _is_number(value) -> bool:
+    """Whether it is a number of a size that quantities have; true, nan and inf are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
 def number(least=-np.inf, most=np.inf, default=MISSING, whole=False):
     """A field that holds one number."""
 
     def check(value, where):
-        good = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        if not good or not np.isfinite(value) or not least <= value <= most:
+        good = _is_number(value) and (isinstance(value, int) or not whole)
+        if not good or not least <= value <= most:
             kind = "a whole number" if whole else "a number"
             raise TaskError(f"{where} is {value!r}; it must be {kind} from {least:g} to {most:g}.")
         return int(value) if whole else float(value)
@@ -39,7 +45,7 @@ def vector(size, default=MISSING):
     """A field that holds a list of numbers."""
 
     def check(value, where):
-        numbers = isinstance(value, list) and all(isinstance(x, int | float) and np.isfinite(x) for x in value)
+        numbers = isinstance(value, list) and all(map(_is_number, value))
         if not numbers or len(value) != size:
             raise TaskError(f"{where} is {value!r}; it must be a list of {size} numbers.")
         return tuple(map(float, value))
@@ -62,7 +68,7 @@ def named_numbers():
     """A field that holds {name: number}."""
 
     def check(value, where):
-        if not isinstance(value, dict) or not all(isinstance(x, int | float) for x in value.values()):
+        if not isinstance(value, dict) or not all(map(_is_number, value.values())):
             raise TaskError(f"{where} is {value!r}; it must look like {{ joint1 = 0.3, joint2 = 1.2 }}.")
         return {name: float(x) for name, x in value.items()}
 
@@ -290,17 +296,19 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     """Reads a task from its text; robot files are looked for in `folder`. Raises as `load`."""
     try:
         tree = tomllib.loads(source)
-    except tomllib.TOMLDecodeError as error:
-        raise TaskError(f"not valid TOML: {error}.") from None
+    except RecursionError:
+        raise TaskError("this is no task: its values are nested too deeply.") from None
+    except ValueError as error:  # also of a whole number with thousands of digits
+        raise TaskError(f"not valid TOML: {str(error).split(';')[0]}.") from None
     kind = tree.pop("kind", None)
-    if kind not in SECTIONS:
+    if not isinstance(kind, str) or kind not in SECTIONS:
         raise TaskError(f"the key kind is {kind!r}; it must be one of {', '.join(map(repr, SECTIONS))}.")
     extra = {}
     if kind == "identify":
         extra["attitude"] = _attitude(tree.pop("attitude", None))
     _refuse_unknown(tree, {*SECTIONS[kind], "phases"}, "the task")
     phases = tree.get("phases", {})
-    _refuse_unknown(phases, PHASES[kind], "[phases]")
+    _refuse_unknown(_table(phases, "[phases]"), PHASES[kind], "[phases]")
     sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in SECTIONS[kind].items()}
     sections["phases"] = {p: _section(phases.get(p, {}), Phase, f"[phases.{p}]") for p in PHASES[kind]}
     chaser = _chaser(sections["robot"], folder)
@@ -311,14 +319,19 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
 def _attitude(value):
     if value is None:
         return None
-    if not isinstance(value, int | float) or not 0 < value <= 3:
+    if not _is_number(value) or not 0 < value <= 3:
         raise TaskError(f"attitude is {value!r}; it is the largest turn of the base, from 0 to 3 rad.")
     return float(value)
 
 
-def _section(values, record, where):
+def _table(values, where):
     if not isinstance(values, dict):
         raise TaskError(f"{where} is {values!r}; it must be a section with keys.")
+    return values
+
+
+def _section(values, record, where):
+    _table(values, where)
     known = {f.name: f for f in fields(record)}
     _refuse_unknown(values, known, where)
     missing = [k for k, f in known.items() if f.default is MISSING and f.default_factory is MISSING and k not in values]
@@ -341,6 +354,8 @@ def _close(word, known):
 def _model(name, folder):
     if Path(name).suffix in (".json", ".urdf"):
         path = Path(folder) / name
+        if not path.resolve().is_relative_to(Path(folder).resolve()):
+            raise TaskError(f"the robot file {name} is outside of the task's folder; put it into {folder}.")
         if not path.is_file():
             raise TaskError(f"there is no robot file {path}; the path is relative to the task's folder.")
         return sdyn.load(path)

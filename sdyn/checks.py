@@ -1,12 +1,17 @@
 """Checks of what a user hands in: each returns clean NumPy data or raises one sentence that says what to do."""
 
 import difflib
+import re
 
 import numpy as np
 
 
 class RobotError(ValueError):
     """A robot, an edit or a file that cannot be what it says; the message names the part and the remedy."""
+
+
+FAR = 1e3  # m; lengths up to here are ordinary ones
+LARGEST, SMALLEST = 1e30, 1e-30  # what physical quantities may be, beside zero: their products stay within float64
 
 
 def number(value, what: str, *, least: float = -np.inf) -> float:
@@ -19,6 +24,20 @@ def number(value, what: str, *, least: float = -np.inf) -> float:
         raise RobotError(f"{what} is {x}; it must be finite.")
     if x < least:
         raise RobotError(f"{what} is {x:g}; it must be at least {least:g}.")
+    return x
+
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # not nan, inf, 1_000 or full-width digits
+
+
+def written(text: str, what: str) -> float:
+    """The finite number that a word of a file or of a command spells."""
+    if not NUMBER.fullmatch(text):
+        hint = " Expand it with xacro first." if "${" in text else ""
+        raise RobotError(f"{what} holds {text[:40]!r} where a number must be.{hint}")
+    x = float(text)
+    if not np.isfinite(x):
+        raise RobotError(f"{what} is {text[:40]}; it must be finite.")
     return x
 
 
@@ -38,6 +57,17 @@ def array(value, shape: tuple[int, ...], what: str) -> np.ndarray:
     return read_only(x)
 
 
+def quantity(value, what: str, shape: tuple[int, ...] = (), *, small: bool = True):
+    """A number or an array whose products with others neither overflow nor, unless `small`, vanish."""
+    x = array(value, shape, what) if shape else number(value, what)
+    size = np.abs(x).max(initial=0.0)
+    if size > LARGEST:
+        raise RobotError(f"{what} holds {size:.3g}, which is beyond {LARGEST:g}; check its unit.")
+    if not small and 0.0 < size < SMALLEST:
+        raise RobotError(f"{what} is {size:.3g}, which is below {SMALLEST:g}; set it to 0, or check its unit.")
+    return x
+
+
 def read_only(x: np.ndarray) -> np.ndarray:
     """The array itself, which can no longer be written to."""
     x.flags.writeable = False
@@ -47,18 +77,20 @@ def read_only(x: np.ndarray) -> np.ndarray:
 def unit(value, what: str, size: int = 3) -> np.ndarray:
     """A unit vector; one that is off by rounding is normalised, any other is refused."""
     x = array(value, (size,), what)
-    length = np.linalg.norm(x)
-    if length == 0.0:
+    largest = np.abs(x).max()
+    if largest == 0.0:
         raise RobotError(f"{what} is zero; give it a direction.")
+    length = largest * np.linalg.norm(x / largest)  # neither overflows nor vanishes
     if abs(length - 1.0) > 1e-6:
-        raise RobotError(f"{what} has length {length:.6g}; give a unit vector, here {(x / length).tolist()}.")
+        better = (x / largest / np.linalg.norm(x / largest)).tolist()
+        raise RobotError(f"{what} has length {length:.6g}; give a unit vector, here {better}.")
     return x if abs(length - 1.0) < 4e-16 else array(x / length, (size,), what)
 
 
 def rotation(value, what: str) -> np.ndarray:
     """A proper rotation matrix, to 1e-6; rounding is removed by the nearest rotation."""
     R = array(value, (3, 3), what)
-    if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
+    if np.abs(R).max() > 2.0 or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
         raise RobotError(f"{what} is not a rotation matrix (orthonormal, determinant +1): {R.tolist()}.")
     if np.abs(R.T @ R - np.eye(3)).max() > 4e-15:  # what the line below leaves stays as it is, bit for bit
         U, _, Vt = np.linalg.svd(R)
@@ -71,8 +103,8 @@ def pose(value, what: str) -> tuple[np.ndarray, np.ndarray]:
     if value is None:
         return array(np.eye(3), (3, 3), what), array(np.zeros(3), (3,), what)
     if len(value) == 2:
-        return rotation(value[0], f"the rotation of {what}"), array(value[1], (3,), f"the position of {what}")
-    x = array(value, (7,), what)
+        return rotation(value[0], f"the rotation of {what}"), quantity(value[1], f"the position of {what}", (3,))
+    x = quantity(value, what, (7,))
     w, v = (u := unit(x[3:], f"the quaternion of {what}", 4))[0], u[1:]
     R = np.eye(3) + 2 * w * hat(v) + 2 * hat(v) @ hat(v)
     return rotation(R, what), array(x[:3], (3,), what)

@@ -17,7 +17,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from sdyn import drawing, edits, models
+from sdyn import compiled, drawing, edits, models
 from sdyn.checks import RobotError
 from sdyn.files import FORMATS, load
 
@@ -229,9 +229,8 @@ def _planners():
 
     jax.config.update("jax_enable_x64", True)
     folder = os.environ.get("SDYN_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sdyn"
-    if str(folder) != "off":
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if str(folder) != "off" and (changed := compiled.keep_in(Path(folder))):
+        _say(f"{len(changed)} compiled programs in {folder} were damaged and are made again.", _errors())
     import planners
 
     return planners
@@ -280,5 +279,9 @@ def _say(text, to: Console = console):
 
 
 def _fail(text, code: int = 1) -> int:
-    _say(f"error: {text}", Console(stderr=True, highlight=False))
+    _say(f"error: {text}", _errors())
     return code
+
+
+def _errors() -> Console:
+    return Console(stderr=True, highlight=False)

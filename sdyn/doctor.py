@@ -11,12 +11,13 @@ from itertools import combinations
 
 import numpy as np
 
-from sdyn.checks import hat, is_physical, principal_moments
+from sdyn.checks import FAR, RobotError, hat, is_physical, principal_moments
 from sdyn.posture import link_poses, turn
 from sdyn.robot import Robot
 
 SIZE = 100.0  # m; the radius of gyration and the offset of a centre of mass that pass without a question
-EMPTY = 1e-12  # share of the largest entry of an inertia below which it counts as none
+EMPTY = 1e-12  # share that is left of what an inertia is summed up from, below which it counts as none
+LIGHT = 1e-9  # share of the mass of a robot below which a link does not count as ordinary
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,33 @@ def examine(robot: Robot) -> tuple[Finding, ...]:
     found = [x for link in robot.links for x in _link(link)]
     found += [x for joint in robot.moving for x in _joint(joint)]
     found += [x for name, value in robot.locked.items() for x in _locked(robot.joint(name), value)]
-    found += _massless(repaired(robot))
+    found += loose_joints(repaired(robot))
     return tuple(sorted(found, key=lambda x: ("error", "warning", "note").index(x.level)))
+
+
+def refuse_loose(robot: Robot) -> None:
+    """Refuse a robot with a joint, or a free base, that nothing resists: its acceleration is not determined.
+
+    Robots of ordinary links pass without a closer look, which would take longer than all other work on a structure.
+    """
+    if not _is_ordinary(robot):
+        for finding in loose_joints(robot):
+            raise RobotError(f"{finding.part} {finding.wrong}; {finding.repair}.")
+
+
+def _is_ordinary(robot) -> bool:
+    """Whether every moving body, and a free base, has a link that resists any motion by itself."""
+    solid, tree = set(), robot.tree
+    least = LIGHT * sum(link.mass for link in robot.links)
+    body = [0] * len(robot.links)
+    for i in tree.order:
+        moves = tree.parent[i] < 0 or robot.moves[tree.joint[i]]
+        body[i] = i if moves else body[tree.parent[i]]
+        if robot.links[i].is_solid and robot.links[i].mass > least:
+            solid.add(body[i])
+    free = set(body) - ({tree.order[0]} if robot.grounded else set())
+    near = all(joint.is_near for joint in robot.joints) and all(np.abs(x).max() < FAR for x in robot.locked.values())
+    return near and free <= solid
 
 
 def repaired(robot: Robot) -> Robot:
@@ -128,28 +154,27 @@ def _locked(joint, value):
             yield Finding("warning", f"joint {joint.name!r}", wrong, "lock it within them")
 
 
-def _massless(robot):
+def loose_joints(robot):
     """Joints that nothing resists, at a configuration without symmetry: there the mass matrix is singular.
 
     Articulated inertias of all links, about the origin and in the axes of the base link, from the tips inwards.
     """
     tree = robot.tree
-    values = _crooked(robot)
+    values = crooked(robot)
     R, p = link_poses(robot, robot.configuration(values))
     index = {link.name: i for i, link in enumerate(robot.links)}
-    inertia = np.array([_spatial(link, R[i], p[i]) for i, link in enumerate(robot.links)])
+    inertia = np.array([spatial(link, R[i], p[i]) for i, link in enumerate(robot.links)])
     bare = [link.mass == 0.0 and not link.inertia.any() for link in robot.links]  # nor anything further out
     for i in reversed(tree.order[1:]):
         joint, up = robot.joints[tree.joint[i]], tree.parent[i]
         IA = inertia[i]
-        size = np.abs(IA).max()
         if not robot.is_locked(joint):
             above = index[joint.parent]
-            screws = _screws(joint, values[joint.name], R[above], p[above])
+            screws = screws_of(joint, values[joint.name], R[above], p[above])
             for S in screws[::-1] if tree.forward[i] else screws:
                 U = IA @ S
                 D = S @ U + joint.rotor_inertia
-                if D <= EMPTY * size or D == 0.0:
+                if D <= EMPTY * (np.abs(S) @ np.abs(IA) @ np.abs(S) + joint.rotor_inertia):
                     yield _loose(joint, robot.links[i], bare[i])
                     break
                 IA = IA - np.outer(U, U) / D
@@ -175,7 +200,7 @@ def _loose(joint, link, bare) -> Finding:
     return Finding("error", f"joint {joint.name!r}", wrong, "give the link an inertia, or the joint a rotor_inertia")
 
 
-def _crooked(robot) -> dict:
+def crooked(robot) -> dict:
     """Joint values without symmetry."""
     values = {}
     for k, joint in enumerate(robot.moving):
@@ -184,14 +209,14 @@ def _crooked(robot) -> dict:
     return values
 
 
-def _spatial(link, R, p) -> np.ndarray:
+def spatial(link, R, p) -> np.ndarray:
     """Spatial inertia of a link about the world's origin [kg m^2, kg m, kg], angular first."""
     c = hat(R @ link.com + p)
     m = link.mass
     return np.block([[R @ link.inertia @ R.T + m * c @ c.T, m * c], [m * c.T, m * np.eye(3)]])
 
 
-def _screws(joint, value, R, p) -> np.ndarray:
+def screws_of(joint, value, R, p) -> np.ndarray:
     """The screws of a joint in world axes about the world's origin, each carried along by the ones before it.
 
     Args:

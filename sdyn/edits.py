@@ -2,7 +2,7 @@
 
 import re
 
-from sdyn.checks import RobotError, known
+from sdyn.checks import RobotError, known, written
 from sdyn.parts import CLOSURES
 from sdyn.robot import Robot
 
@@ -80,10 +80,7 @@ def _values(text) -> dict:
 
 
 def _number(text) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise RobotError(f"{text!r} is no number; give radians or metres, as in 0.3.") from None
+    return written(text, "a value in radians or metres")
 
 
 def _numbers(text) -> list[float]:

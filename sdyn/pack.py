@@ -7,10 +7,14 @@ import numpy as np
 
 from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, LoopRow, SlotRow
 from sdyn.checks import RobotError
+from sdyn.doctor import refuse_loose
 from sdyn.merge import derive
 from sdyn.parts import CLOSURES
 from sdyn.robot import GROUND, Robot
 from sdyn.schedule import schedule
+
+MEMORY = 2e9
+"""Bytes that packing may take; they grow with the square of the bodies. A chain of 10 000 joints takes half of them."""
 
 
 def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = None, dtype=None) -> Chain:
@@ -27,23 +31,27 @@ def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = 
         The chain. A structure of the same capacity is the same compile key.
 
     Raises:
-        RobotError: If a body without inertia hangs from a moving joint, or the capacity is too small.
+        RobotError: If nothing resists the motion of a joint or of a free base, or the capacity is too small.
     """
     capacity = _capacity_of([robot], width or 1, padded=False) if capacity is None else capacity
     return jax.device_put(_arrays(robot, capacity, _float_type(dtype)))
 
 
-def capacity(robots, *, width: int = 1) -> Capacity:
+def capacity(robots, *, width: int = 1, memory: float = MEMORY) -> Capacity:
     """Sizes that hold any of the robots.
 
     Args:
         robots: The variants, at least one.
         width: Bodies in a step of the schedule.
+        memory: What packing one of them may take [bytes].
+
+    Raises:
+        RobotError: If it would take more; `pack` without a capacity has the same limit.
     """
     robots = list(robots)
     if not robots:
         raise RobotError("capacity: the list of robots is empty.")
-    return _capacity_of(robots, width, padded=True)
+    return _capacity_of(robots, width, padded=True, memory=memory)
 
 
 def family(robots, *, width: int = 1, dtype=None) -> Chain:
@@ -104,9 +112,16 @@ def _float_type(dtype):
 # ---- sizes -----------------------------------------------------------------------------------------------------------
 
 
-def _capacity_of(robots, width, padded) -> Capacity:
+def _capacity_of(robots, width, padded, memory=MEMORY) -> Capacity:
     if width < 1:
         raise RobotError(f"the width is {width}; a step holds at least one body.")
+    bodies = max(sum(joint.dof for joint in robot.moving) for robot in robots)
+    most = bodies * (bodies + 8 * max(len(robot.links) for robot in robots))  # `Chain.ancestors`, and in `merge.derive`
+    if most > memory:
+        raise RobotError(
+            f"pack: {bodies} bodies take {most / 1e9:.3g} GB, and {memory / 1e9:.3g} GB are allowed; lock joints, or "
+            f"make the capacity with memory={most:.2g}."
+        )
     union = lambda key: tuple(dict.fromkeys(part.name for robot in robots for part in getattr(robot, key)))
     links, joints, frames, loops = (union(key) for key in ("links", "joints", "frames", "loops"))
     sizes = [_sizes(robot, len(schedule(_bodies(robot).parent, width))) for robot in robots]
@@ -180,25 +195,6 @@ def _bodies(robot) -> Bodies:
     return Bodies(parent, link, screw, of_link)
 
 
-def _check_inertia(robot, bodies):
-    """Refuse a moving joint with neither inertia beyond it nor a rotor: its acceleration is not determined."""
-    heavy = [False] * (len(bodies.parent) + 1)
-    for link, b in zip(robot.links, bodies.of_link, strict=True):
-        heavy[b] |= link.is_heavy
-    for b in reversed(range(len(bodies.parent))):
-        i = bodies.link[b]
-        joint = robot.joints[robot.tree.joint[i]]
-        heavy[b] |= joint.rotor_inertia > 0
-        if not heavy[b]:
-            raise RobotError(
-                f"pack: link {robot.links[i].name!r} and what hangs from it have no mass, so joint {joint.name!r} has "
-                f"no defined acceleration; give the link mass, lock the joint, or give the joint a rotor_inertia."
-            )
-        heavy[bodies.parent[b]] |= heavy[b]
-    if not heavy[-1] and not robot.grounded:
-        raise RobotError(f"pack: the free robot has no mass at all; give link {robot.base!r} a mass, or ground it.")
-
-
 # ---- arrays ----------------------------------------------------------------------------------------------------------
 
 
@@ -207,7 +203,7 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
     bodies = _bodies(robot)
     steps = schedule(bodies.parent, capacity.width)
     _check_fits(robot, capacity, _sizes(robot, len(steps)))
-    _check_inertia(robot, bodies)
+    refuse_loose(robot)
 
     # where the robot's links, joints and bodies are in the arrays; the last entry, also number -1, stands for none
     links, joints = capacity.numbers["link"], capacity.numbers["joint"]
@@ -231,7 +227,11 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
         slot_index, slot_value, base_value, ancestors, link_index, mass, com, inertia, link_pose, joint_index,
         joint_value, dof_value, quat_index, dof_to_q, frame_index, frame_value, *loops, capacity,
     )  # fmt: skip
-    return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, packed)
+    with np.errstate(over="ignore"):
+        packed = jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, packed)
+    if not all(np.isfinite(x).all() for x in (packed.slot_value, packed.base_value, packed.link_inertia)):
+        raise RobotError(f"pack: a mass, an inertia or a length is beyond {dtype}; pack with dtype=float64.")
+    return packed
 
 
 def _coordinates(robot, capacity, joint_at):

@@ -9,7 +9,18 @@ from functools import cached_property
 
 import numpy as np
 
-from sdyn.checks import RobotError, array, distinct, is_physical, number, principal_moments, rotation, unit
+from sdyn.checks import (
+    FAR,
+    RobotError,
+    array,
+    distinct,
+    is_physical,
+    number,
+    principal_moments,
+    quantity,
+    rotation,
+    unit,
+)
 
 
 @dataclass(frozen=True)
@@ -88,9 +99,10 @@ class Link(Part):
     def __post_init__(self):
         here = f"link {self.name!r}"
         put = lambda key, value: object.__setattr__(self, key, value)
-        put("mass", number(self.mass, f"the mass of {here}", least=0.0))
-        put("com", array(self.com, (3,), f"the centre of mass of {here}"))
-        put("inertia", array(self.inertia, (3, 3), f"the inertia of {here}"))
+        number(self.mass, f"the mass of {here}", least=0.0)
+        put("mass", quantity(self.mass, f"the mass of {here}", small=False))
+        put("com", quantity(self.com, f"the centre of mass of {here}", (3,)))
+        put("inertia", quantity(self.inertia, f"the inertia of {here}", (3, 3), small=False))
         if np.abs(self.inertia - self.inertia.T).max() > 1e-9 * max(np.abs(self.inertia).max(), 1e-300):
             raise RobotError(f"the inertia of {here} is not symmetric: {self.inertia.tolist()}.")
         if not self.allow_unphysical and not is_physical(self.mass, self.inertia):
@@ -102,9 +114,10 @@ class Link(Part):
             )
 
     @cached_property
-    def is_heavy(self) -> bool:
-        """Whether it resists any motion: it has a mass or an inertia."""
-        return self.mass > 0 or bool(self.inertia.any())
+    def is_solid(self) -> bool:
+        """Whether it resists any motion, about every axis by at least mass times (1e-5 m)^2."""
+        near = np.abs(self.com).max() < FAR and is_physical(self.mass, self.inertia)
+        return bool(near and self.mass > 0 and principal_moments(self.inertia)[0] > 1e-10 * self.mass)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +168,12 @@ class Joint(Part):
         if self.parent == self.child:
             raise RobotError(f"{here} joins link {self.parent!r} to itself; parent and child must differ.")
         put("rotation", rotation(self.rotation, f"the rotation of {here}"))
-        put("position", array(self.position, (3,), f"the position of {here}"))
+        put("position", quantity(self.position, f"the position of {here}", (3,)))
         put("axis", unit(self.axis, f"the axis of {here}"))
-        put("pitch", number(self.pitch, f"the pitch of {here}"))
+        put("pitch", quantity(self.pitch, f"the pitch of {here}"))
         for key in ("damping", "stiffness", "rotor_inertia"):
-            put(key, number(getattr(self, key), f"the {key} of {here}", least=0.0))
+            number(getattr(self, key), f"the {key} of {here}", least=0.0)
+            put(key, quantity(getattr(self, key), f"the {key} of {here}", small=key != "rotor_inertia"))
         if self.pitch and self.kind != "helical":
             raise RobotError(f"{here} is {self.kind} and has a pitch; only a helical joint has one.")
         if self.stiffness and self.kind == "spherical":
@@ -192,6 +206,11 @@ class Joint(Part):
     def nq(self) -> int:
         """Entries of q."""
         return KINDS[self.kind].nq
+
+    @cached_property
+    def is_near(self) -> bool:
+        """Whether its lengths are ordinary ones."""
+        return bool(max(np.abs(self.position).max(), abs(self.pitch)) < FAR)
 
     @cached_property
     def screws(self) -> np.ndarray:
@@ -248,7 +267,7 @@ class Frame(Part):
     def __post_init__(self):
         here = f"frame {self.name!r}"
         object.__setattr__(self, "rotation", rotation(self.rotation, f"the rotation of {here}"))
-        object.__setattr__(self, "position", array(self.position, (3,), f"the position of {here}"))
+        object.__setattr__(self, "position", quantity(self.position, f"the position of {here}", (3,)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from itertools import compress
 
 import numpy as np
 
-from sdyn.checks import RobotError, array, distinct, known, number, pose, read_only, unit
+from sdyn.checks import RobotError, array, distinct, known, pose, quantity, read_only, unit
 from sdyn.parts import KINDS, Frame, Joint, Link, Loop, Part, renamed
 from sdyn.posture import link_poses
 from sdyn.table import Table, table
@@ -147,7 +147,7 @@ class Robot(Part):
         """
         joints, out = dict(joints or {}), []
         if not self.grounded:
-            out += [array(position, (3,), "the position"), unit(quaternion, "the quaternion", 4)]
+            out += [quantity(position, "the position", (3,)), unit(quaternion, "the quaternion", 4)]
         for joint in self.moving:
             rest = np.r_[1.0, 0.0, 0.0, 0.0] if joint.kind == "spherical" else np.zeros(joint.nq)
             out.append(_value(joint, joints.pop(joint.name, rest)))
@@ -399,8 +399,8 @@ def _value(joint, value) -> np.ndarray:
     if joint.kind == "spherical":
         return unit(value, what, 4)
     if joint.nq == 1 and np.ndim(value) == 0:
-        return read_only(np.array([number(value, what)]))
-    return array(value, (joint.nq,), what)
+        return read_only(np.array([quantity(value, what)]))
+    return quantity(value, what, (joint.nq,))
 
 
 _pose = pose  # `ground` has an argument of the same name

@@ -21,18 +21,15 @@ Writing
 Source of the format: http://wiki.ros.org/urdf/XML.
 """
 
-import math
-import re
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from sdyn.checks import RobotError, distinct
+from sdyn.checks import RobotError, distinct, written
 from sdyn.parts import Frame, Joint, Link
 from sdyn.robot import Robot
 
 WORLD = "world"
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 KINDS = {
     "revolute": "revolute",
     "continuous": "revolute",
@@ -267,28 +264,18 @@ def _needed(element, tag, here):
     return found
 
 
-def _value(text: str, what: str) -> float:
-    if not NUMBER.fullmatch(text):
-        hint = " Expand it with xacro first." if "${" in text else ""
-        raise RobotError(f"{what} holds {text[:40]!r} where a number must be.{hint}")
-    x = float(text)
-    if not math.isfinite(x):
-        raise RobotError(f"{what} is {text[:40]}; it must be finite.")
-    return x
-
-
 def _number(element, key, here) -> float:
     text = element.get(key)
     if text is None:
         raise RobotError(f"{here} has no {key}; add {key}=... to <{element.tag}>.")
-    return _value(text.strip(), here if key == "value" else f"the {key} in {here}")
+    return written(text.strip(), here if key == "value" else f"the {key} in {here}")
 
 
 def _vector(element, key, here) -> np.ndarray:
     words = element.get(key, "").split()
     if len(words) != 3:
         raise RobotError(f"the {key} in {here} is {element.get(key)!r}; it must be three numbers.")
-    return np.array([_value(word, f"the {key} in {here}") for word in words])
+    return np.array([written(word, f"the {key} in {here}") for word in words])
 
 
 def _origin(element, here):

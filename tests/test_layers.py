@@ -31,7 +31,7 @@ DEVICE = [
     ["transition", "integrate"],
     ["rollout"],
 ]
-LAST = [["__init__"], ["cli"], ["__main__"]]
+LAST = [["__init__"], ["compiled"], ["cli"], ["__main__"]]
 ORDER = [name for rows in (HOST, DEVICE, LAST) for row in rows for name in row]
 FREE_OF_JAX = [name for row in HOST for name in row] + ["merge"]
 
