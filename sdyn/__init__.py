@@ -36,3 +36,6 @@ from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
 from sdyn.integrate import integrate
 from sdyn.rollout import Phases, hybrid_rollout, rollout
+
+# what a scene requires
+from sdyn.reduce import Report, Scene, reduce

@@ -61,6 +61,7 @@ SIGNATURES = {
     ),
     "Frame": ("name link rotation position", ""),
     "Robot": ("links joints frames loops base grounded", ""),
+    "reduce": ("robot scene", ""),
     "Robot.lock": ("self joints", ""),
     "Robot.unlock": ("self joints", ""),
     "Robot.reroot": ("self link", ""),
@@ -73,7 +74,7 @@ SIGNATURES = {
     "Robot.table": ("self base merged", ""),
     "Robot.neutral": ("self", ""),
 }
-LATER = ("diagnose", "reduce")
+LATER = ("diagnose",)
 
 
 @pytest.mark.parametrize("name", SIGNATURES)

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from host_dynamics import mass_matrix
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_files import arm, crowded
@@ -19,7 +20,6 @@ from planners.task import FOLDER, TaskError
 from planners.task import parse as parse_task
 from sdyn import doctor, json_format, urdf
 from sdyn.checks import RobotError
-from sdyn.posture import link_poses
 
 SLOWEST = 2.0  # s, for one file: a hang, not a speed; measured 0.05 s
 MANY = dict(derandomize=True, deadline=None, database=None)
@@ -95,30 +95,6 @@ def computable(read, data) -> bool:
     assert np.isfinite(M).all() and (size > 0).all()
     assert np.linalg.eigvalsh(M / np.outer(size, size)).min(initial=1.0) > 0
     return True
-
-
-def mass_matrix(robot) -> np.ndarray:
-    """M = Σ Jᵀ I J over the links, at a configuration without symmetry, base at the identity."""
-    tree, values = robot.tree, doctor.crooked(robot)
-    R, p = link_poses(robot, robot.configuration(values))
-    index = {link.name: i for i, link in enumerate(robot.links)}
-    J, columns = np.zeros((len(robot.links), 6, robot.nv)), {}
-    at = 0 if robot.grounded else 6
-    for joint in robot.moving:
-        columns[joint.name] = slice(at, at := at + joint.dof)
-    for i in tree.order:
-        if tree.parent[i] < 0:
-            J[i, :, :6] = np.eye(6) if not robot.grounded else 0
-            continue
-        joint = robot.joints[tree.joint[i]]
-        J[i] = J[tree.parent[i]]
-        if joint.name in columns:
-            up = index[joint.parent]
-            screws = doctor.screws_of(joint, values[joint.name], R[up], p[up]).T
-            J[i][:, columns[joint.name]] += screws if tree.forward[i] else -screws
-    M = sum(j.T @ doctor.spatial(link, R[i], p[i]) @ j for i, (link, j) in enumerate(zip(robot.links, J, strict=True)))
-    rotors = [np.full(joint.dof, joint.rotor_inertia) for joint in robot.moving]
-    return M + np.diag(np.concatenate([np.zeros(0 if robot.grounded else 6), *rotors]))
 
 
 counts = {}
