@@ -22,6 +22,7 @@ from sdyn.constraints import Status, constrained_dynamics, constrained_inverse_d
 from sdyn.jacobians import forward_dynamics_jacobians
 from sdyn.partition import Partition, partition
 from sdyn.drift import project
+from sdyn.conditioning import Trust, conditioning
 from sdyn.momentum import centre_of_mass, kinetic_energy, momentum
 from sdyn.floating import (
     floating_forward_dynamics,
@@ -36,6 +37,7 @@ from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
 from sdyn.integrate import integrate
 from sdyn.rollout import Phases, hybrid_rollout, rollout
+from sdyn.diagnose import Diagnosis, diagnose, growth
 
 # what a scene requires
 from sdyn.reduce import Report, Scene, reduce

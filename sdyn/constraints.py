@@ -228,11 +228,17 @@ def _slope(function, primals, tangents):
     return jax.jvp(f, tuple(leaves[i] for i in at), tuple(along[i] for i in at))[1]
 
 
-def _status(chain, q, v, vdot, pairs) -> Status:
+def closure_spectrum(chain, q):
+    """Rank of the closures, their smallest singular value, and the largest over it: as in `Status`."""
     system = delassus(chain, q)
     count, eigenvalues = spectrum(system.G, system.dead, system.tolerance, system.share)
     sigma = jnp.sqrt(jnp.maximum(eigenvalues[::-1], 0))
     least = jnp.where(count > 0, sigma[jnp.maximum(count - 1, 0)], 1.0)
+    return count, least, jnp.where(count > 0, sigma[0], 1.0) / least
+
+
+def _status(chain, q, v, vdot, pairs) -> Status:
+    count, least, ratio = closure_spectrum(chain, q)
     drift = jnp.abs(loop_residual(chain, q)).max(initial=0.0)
     noise = jnp.maximum(drift, 64 * jnp.finfo(q.dtype).eps)
     live = jnp.sum(chain.row_index[ClosureRow.LIVE])
@@ -240,7 +246,7 @@ def _status(chain, q, v, vdot, pairs) -> Status:
         rank=count,
         redundant=count < live,
         sigma_min=least,
-        condition=jnp.where(count > 0, sigma[0], 1.0) / least,
+        condition=ratio,
         drift=drift,
         error=jnp.abs(closure_acceleration(chain, q, v, vdot)).max(initial=0.0),
         singular=least < 1e3 * noise,

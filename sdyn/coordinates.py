@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from sdyn.chain import BaseRow, Chain
+from sdyn.chain import BaseRow, Chain, JointRow
 from sdyn.rotation import conjugate, exp, matrix, normalised, product
 from sdyn.spatial import cross
 
@@ -73,6 +73,24 @@ def gravity_of(pose: Pose, gravity):
     if gravity is None:
         return jnp.zeros((0, 1), pose.R.dtype)
     return jnp.concatenate([jnp.zeros(3, pose.R.dtype), pose.R.T @ gravity])[:, None]
+
+
+def live_entries(chain: Chain):
+    """Which entries of v are of a free base, or of a joint that moves [nv]; the others are empty."""
+    first, count = chain.joint_index[JointRow.V], chain.joint_index[JointRow.DOF]
+    entry = jnp.arange(chain.capacity.nv)
+    joints = ((entry >= first[:, None]) & (entry < (first + count)[:, None])).any(0)
+    return jnp.concatenate([jnp.broadcast_to(chain.free == 1, (chain.capacity.base_nv,)), joints])
+
+
+def quaternions_of(chain: Chain, q):
+    """Quaternions of a free base and of spherical joints [quaternions, 4]; empty ones are the identity."""
+    nb, one = chain.capacity.base_nq, jnp.array([1, 0, 0, 0], q.dtype)
+    found = [jnp.where(chain.free == 1, q[3:7], one)[None]] if nb else []
+    if chain.capacity.quaternions:
+        places = nb + chain.quat_index[0][:, None] + jnp.arange(4)
+        found.append(jnp.where(_quat_is_real(chain)[:, None], q[places], one))
+    return jnp.concatenate([jnp.zeros((0, 4), q.dtype), *found])
 
 
 def _quat_is_real(chain):

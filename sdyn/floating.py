@@ -23,10 +23,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sdyn.chain import Chain, JointRow
+from sdyn.chain import Chain
 from sdyn.closures import loop_jacobian, loop_residual
 from sdyn.constraints import forward_dynamics
-from sdyn.coordinates import pose_of
+from sdyn.coordinates import live_entries, pose_of
 from sdyn.dynamics import inverse_dynamics, mass_matrix
 from sdyn.inputs import expect
 from sdyn.kinematics import frame_jacobian
@@ -182,7 +182,7 @@ def reaction_null_space(
         together. Differentiable where the rank does not change; where it does, N jumps.
     """
     (q,) = expect(chain, q=q)
-    base, moves = _base(chain, mass_matrix(chain, q)), _moves(chain)
+    base, moves = _base(chain, mass_matrix(chain, q)), live_entries(chain)[chain.capacity.base_nv :]
     size = 1 / jnp.trace(base.compliance)  # an inertia; with the mass, a length
     turn, push = _about_centre(base)
     A = jnp.concatenate([turn / size, push / jnp.sqrt(size * base.mass)])
@@ -247,13 +247,6 @@ def _about_centre(base: _Base):
 def _with_base(chain, base, joints):
     """The two parts in one vector, laid out like v."""
     return joints if chain.capacity.base_nv == 0 else jnp.concatenate([base, joints])
-
-
-def _moves(chain):
-    """Which joint entries of v belong to a joint."""
-    first, count = chain.joint_index[JointRow.V], chain.joint_index[JointRow.DOF]
-    entry = jnp.arange(chain.capacity.nv)
-    return ((entry >= first[:, None]) & (entry < (first + count)[:, None])).any(0)
 
 
 @jax.custom_jvp

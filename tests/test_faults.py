@@ -36,6 +36,7 @@ ROWS = {
     "wrong shape, type or size": ["test_compile::test_wrong_shapes_types_and_names"],
     "huge sizes": ["test_faults::test_huge_robots_are_refused_before_memory_is_taken"],
     "lock by a bad name": ["test_faults::test_names_that_do_not_exist", "test_cli::test_edits_that_cannot_be"],
+    "NaN at run time": ["test_diagnose::test_the_first_bad_step_is_named"],
     "JSON": ["test_files::test_broken_json", "test_files::test_wrong_json"],
     "YAML": ["test_files::test_paths_that_hold_no_robot"],
     "pickle, npz": ["test_faults::test_a_plan_is_never_unpickled", "test_faults::test_nothing_reads_or_writes_pickles",
