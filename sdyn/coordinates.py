@@ -142,16 +142,21 @@ def retract(chain: Chain, q, xi):
 def increment_rate(chain: Chain, q, xi, v):
     """Time derivative of `xi` where `retract(q0, xi) = q` moves with v:
     θ' = w + 1/2 θ x w + 1/12 θ x (θ x w), and the base's origin with R v."""
-    nv = chain.capacity.base_nv
-    out = v
-    if chain.capacity.quaternions:
-        dofs = nv + _quat_dofs(chain)
-        rate = _rotation_vector_rate(xi[dofs].T, v[dofs].T).T
-        out = out.at[dofs].add(jnp.where(_quat_is_real(chain)[:, None], rate - v[dofs], 0))
-    if nv:
-        base = jnp.concatenate([_rotation_vector_rate(xi[:3], v[:3]), pose_of(chain, q).R @ v[3:6]])
+    out = on_rotations(chain, _rotation_vector_rate, xi, v)
+    if chain.capacity.base_nv:
+        base = jnp.concatenate([out[:3], pose_of(chain, q).R @ v[3:6]])
         out = out.at[:6].set(base * chain.free)
     return out
+
+
+def on_rotations(chain: Chain, f, *x):
+    """The last of the arrays, laid out like v, with f(parts [3, ...] of all) where it describes a rotation."""
+    out = x[-1]
+    if chain.capacity.quaternions:
+        dofs = chain.capacity.base_nv + _quat_dofs(chain)
+        new, old = f(*(y[dofs].T for y in x)).T, out[dofs]
+        out = out.at[dofs].add(jnp.where(_quat_is_real(chain)[:, None], new - old, 0))
+    return out.at[:3].set(f(*(y[:3] for y in x))) if chain.capacity.base_nv else out
 
 
 def _turned(quat, theta):

@@ -16,6 +16,11 @@ from sdyn.constraints import forward_dynamics
 from sdyn.coordinates import increment_rate, retract
 from sdyn.drift import corrected
 from sdyn.inputs import expect
+from sdyn.rosenbrock import rosenbrock_step
+from sdyn.variational import variational_step
+
+METHODS = {"semi_implicit": 1, "rk4": 4, "variational": 2, "implicit": 4}
+"""The orders of the methods: an error of a motion shrinks like dt to this power."""
 
 
 def integrate(
@@ -37,9 +42,11 @@ def integrate(
         q, v: State.
         tau: Force, laid out as v [N m, N].
         dt: Step [s]; may be traced, zero or negative.
-        method: "rk4" (order 4) or "semi_implicit" (order 1, one evaluation).
+        method: "rk4" (order 4), "semi_implicit" (order 1, one evaluation), "variational" (order 2; keeps momentum to
+            rounding and energy without a trend) or "implicit" (order 4, L-stable, for stiff joints and forces).
         drift: How loops stay closed: "project" moves the state back after the step, in the mass metric; a number is a
-            Baumgarte rate [1/s] (cheaper, but the error only decays; rate times dt at most 1), 0 does nothing.
+            Baumgarte rate [1/s] (cheaper, but the error only decays; rate times dt at most 1), 0 does nothing. The
+            variational method closes them itself.
         gravity: Acceleration of free fall, world axes [m/s^2].
         f_ext: Wrenches on the links, as for `forward_dynamics`.
 
@@ -62,13 +69,18 @@ def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_
     options = dict(gravity=gravity) | ({} if project else dict(baumgarte=drift))
     wrenches = f_ext if callable(f_ext) else lambda t, q, v: f_ext
     acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), f_ext=wrenches(t, q, v), **options)
+    if method == "variational":
+        guess = v + dt / 2 * acceleration(t, q, v)
+        return variational_step(chain, q, v, force, wrenches, gravity, guess, t, dt)
     if method == "rk4":
         q, v = _rk4(chain, q, v, acceleration, t, dt)
     elif method == "semi_implicit":
         v = v + dt * acceleration(t, q, v)
         q = retract(chain, q, dt * increment_rate(chain, q, jnp.zeros_like(v), v))
+    elif method == "implicit":
+        q, v = _implicit(chain, q, v, acceleration, t, dt)
     else:
-        raise ValueError(f"integrate: there is no method {method!r}; the methods are 'rk4' and 'semi_implicit'.")
+        raise ValueError(f"integrate: there is no method {method!r}; the methods are {', '.join(METHODS)}.")
     return corrected(chain, q, v) if project and chain.capacity.rows else (q, v)
 
 
@@ -87,3 +99,15 @@ def _rk4(chain, q0, v0, acceleration, t0, dt):
     fractions, weights = jnp.array([0, 1 / 2, 1 / 2, 1], v0.dtype), jnp.array([1 / 6, 1 / 3, 1 / 3, 1 / 6], v0.dtype)
     (_, (xi, dv)), _ = lax.scan(stage, (rest, rest), (fractions, weights))
     return retract(chain, q0, dt * xi), v0 + dt * dv
+
+
+def _implicit(chain, q0, v0, acceleration, t0, dt):
+    """The linearly implicit method in the increment and the rates."""
+
+    def rates(t, y):
+        xi, v = y
+        q = retract(chain, q0, xi)
+        return increment_rate(chain, q, xi, v), acceleration(t, q, v)
+
+    xi, v = rosenbrock_step(rates, (jnp.zeros_like(v0), v0), jnp.asarray(t0, v0.dtype), dt)
+    return retract(chain, q0, xi), v

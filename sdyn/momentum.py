@@ -64,6 +64,15 @@ def link_momenta(chain: Chain, R, p, V):
 def _centre(chain, R, p):
     """Centre of mass in base axes."""
     x = p + (R @ chain.link_com[..., None])[..., 0]
-    present = chain.link_index[LinkRow.SLOT] <= chain.capacity.slots
-    m = jnp.where(present, chain.link_mass, 0)
+    m = _masses(chain)
     return (m @ x) / m.sum()
+
+
+def total_mass(chain: Chain) -> Float[Array, ""]:
+    """Mass of all links [kg]."""
+    return _masses(chain).sum()
+
+
+def _masses(chain):
+    present = chain.link_index[LinkRow.SLOT] <= chain.capacity.slots
+    return jnp.where(present, chain.link_mass, 0)

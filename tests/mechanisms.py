@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import oracles
 
@@ -102,3 +103,29 @@ def two_arms() -> sdyn.Robot:
 
 def with_frame(robot, name, link, position):
     return replace(robot, frames=(*robot.frames, sdyn.Frame(name, link, position=position)))
+
+
+def flyball():
+    """IFToMM A05: a governor whose rods a slider holds by stiff springs and dampers; with its force (t, q, v)."""
+    model = json.loads((oracles.DATA / "flyball_robot.json").read_text())
+    links = [sdyn.Link(f"l{k}", x["mass"], x["com"], x["inertia_com"]) for k, x in enumerate(model["links"])]
+    place = lambda x: (x["X_parent_joint"]["R"], x["X_parent_joint"]["p"], x["axis"])
+    joints = [
+        sdyn.Joint(x["joint"]["name"], x["joint"]["type"], f"l{x['parent']}", f"l{k}", *place(x["joint"]))
+        for k, x in enumerate(model["links"]) if k
+    ]  # fmt: skip
+
+    def force(t, q, v):
+        """In the plane of the rods: the slider's end at (w, s), the middle of a rod at (w + r sin a, 1 - r cos a)."""
+        (spring, _), tau = model["springs"], jnp.zeros(4, q.dtype)
+        r = -spring["point_b"][2]
+        for k in (2, 3):
+            s, c = jnp.sin(q[k]), jnp.cos(q[k])
+            x, z = r * s, 1 - r * c - q[1]
+            length = jnp.sqrt(x * x + z * z)
+            rate = (x * r * c * v[k] + z * (r * s * v[k] - v[1])) / length
+            pull = spring["k"] * (length - spring["rest"]) + spring["c"] * rate
+            tau = tau.at[1].add(pull * z / length).at[k].add(-pull * (x * r * c + z * r * s) / length)
+        return tau
+
+    return sdyn.Robot(links, joints, grounded=True), force

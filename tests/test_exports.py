@@ -117,14 +117,6 @@ def test_planners():
         assert callable(getattr(planners.Plan, key))
 
 
-def test_what_comes_later_is_absent_or_refused():
-    """No name stands there without doing what it promises."""
-    robot = tree(UNBALANCED)
-    chain = sdyn.pack(robot)
-    with pytest.raises(ValueError, match="there is no method 'variational'"):
-        sdyn.integrate(chain, robot.neutral(), np.zeros(14), np.zeros(14), 0.1, method="variational")
-
-
 @pytest.mark.parametrize("layout", ["free", "grounded", "padded"])
 def test_shapes(layout):
     robot = tree(UNBALANCED).lock({"j1": 0.2})

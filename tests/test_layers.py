@@ -28,7 +28,7 @@ DEVICE = [
     ["kinematics"],
     ["dynamics", "jacobians", "closures", "delassus", "partition", "constraints", "drift"],
     ["conditioning", "momentum", "params", "floating", "actuators"],
-    ["transition", "integrate"],
+    ["transition", "rosenbrock", "variational", "integrate"],
     ["rollout", "diagnose"],
 ]
 LAST = [["reduce"], ["__init__"], ["compiled"], ["cli"], ["__main__"]]
