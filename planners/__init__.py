@@ -10,4 +10,5 @@ from planners.certify import Certificate, certify
 from planners.compare import Table, compare
 from planners.driver import plan
 from planners.plan import PhaseResult, Plan, PlanError
+from planners.study import StudyError, study
 from planners.task import Task, TaskError, load

@@ -15,6 +15,7 @@ import sdyn
 from planners.task import Task, parse
 
 FORMAT = 2
+NEW = ".new"
 NEEDED = ("plan.npz", "certificate.json")  # of the files that plan.json names
 
 
@@ -72,9 +73,9 @@ class Plan:
     def save(self, folder) -> None:
         """Writes plan.npz, plan.json, certificate.json, figures and plan.html into a folder, all or none.
 
-        The files are made in a folder beside it and then moved, plan.json last. It names the hashes of the others, so
-        that `load` refuses what a save that was killed between two moves leaves behind. Files of an earlier plan that
-        this one has not are removed; what else is in the folder stays.
+        The files are made in a folder beside it, which one rename then puts into its place as `.new`: until then the
+        earlier plan is whole, from then on this one is, and `load` finishes the moves that a kill left undone. Files
+        of an earlier plan that this one has not are removed; what else is in the folder stays.
         """
         folder = Path(folder)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -82,14 +83,12 @@ class Plan:
         try:
             self._write(made)
             folder.mkdir(exist_ok=True)
-            names = sorted((path.name for path in made.iterdir()), key=lambda name: (name == "plan.json", name))
-            old = _named(folder) - set(names)
-            for name in names:
-                os.replace(made / name, folder / name)
-            for name in old:
-                (folder / name).unlink(missing_ok=True)
-        finally:
-            shutil.rmtree(made)
+            _settle(folder)
+            os.rename(made, folder / NEW)
+        except BaseException:
+            shutil.rmtree(made, ignore_errors=True)
+            raise
+        _settle(folder)
 
     def _write(self, folder):
         from planners import animation, figures
@@ -102,6 +101,9 @@ class Plan:
         files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
         said = _description(self) | {"files": files}
         (folder / "plan.json").write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+        for path in folder.iterdir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
 
     @classmethod
     def load(cls, folder) -> "Plan":
@@ -113,6 +115,7 @@ class Plan:
         from planners.certify import Certificate
 
         folder = Path(folder)
+        _settle(folder)
         said = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         read = _read(folder, said)
         with np.load(io.BytesIO(read["plan.npz"]), allow_pickle=False) as file:
@@ -150,6 +153,22 @@ def _read(folder, said) -> dict[str, bytes]:
                     f"{name} is not the one that plan.json names: saving was interrupted, or it was changed"
                 )
     return out
+
+
+def _settle(folder):
+    """Move what a save left in `.new` to its place, plan.json last; the same after any number of kills."""
+    new = folder / NEW
+    if not new.is_dir():
+        return
+    named = _named(new)
+    for name in sorted(named):
+        if (new / name).exists():
+            os.replace(new / name, folder / name)
+    if named:
+        for name in _named(folder) - named:
+            (folder / name).unlink(missing_ok=True)
+        os.replace(new / "plan.json", folder / "plan.json")
+    os.rmdir(new)
 
 
 def _named(folder) -> set[str]:

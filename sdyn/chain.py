@@ -93,6 +93,8 @@ class Capacity:
     joint_names: tuple[str, ...] = field(compare=False)
     frame_names: tuple[str, ...] = field(compare=False)
     loop_names: tuple[str, ...] = field(compare=False)
+    rebased: bool = False
+    """Whether chains hold a second form, whose base is the heaviest body; see `heaviest.py`."""
 
     @property
     def slots(self) -> int:
@@ -181,6 +183,8 @@ class Chain:
     row_index: Int[Array, "3 rows"]
     """Per row of the closures: its loop, which part of the relative twist it holds, live."""
     capacity: Capacity = field(metadata={"static": True})
+    inner: "Chain | None" = None
+    """The same structure with the heaviest body as base, where the user's is too light to compute from."""
 
     @property
     def dtype(self):

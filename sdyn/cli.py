@@ -237,7 +237,7 @@ def _planners():
 
 
 def _plan_in(folder: Path):
-    if not (folder / "plan.npz").is_file():
+    if not any((folder / name / "plan.npz").is_file() for name in ("", ".new")):
         raise Failure(f"{folder} holds no plan (plan.npz); make one with: sdyn plan TASK --out {folder}")
     planners = _planners()
     try:

@@ -18,6 +18,7 @@ from sdyn.chain import Chain
 from sdyn.coordinates import live_entries
 from sdyn.dynamics import mass_matrix
 from sdyn.inputs import expect
+from sdyn.rebase import inner_of, state_seen
 
 
 class Trust(IntEnum):
@@ -43,6 +44,10 @@ def conditioning(chain: Chain, q: Float[Array, " nq"]) -> tuple[Float[Array, ""]
     """
     (q,) = expect(chain, q=q)
     chain, q = jax.lax.stop_gradient((chain, q))
+    if chain.inner is not None:  # the mass matrix that is solved
+        inner = inner_of(chain)
+        q, _ = state_seen(chain, inner, q, jnp.zeros(chain.nv, chain.dtype))
+        chain = inner
     M, live = mass_matrix(chain, q), live_entries(chain)
     diagonal = jnp.where(live, jnp.diagonal(M), 1)
     good = jnp.isfinite(M).all() & (diagonal > 0).all()

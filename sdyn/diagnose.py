@@ -39,6 +39,8 @@ class Diagnosis:
     """Worst `Trust`."""
     sigma_min: Float[Array, ""]
     """Smallest singular value of the closures, see `Status`; 1 where there are none."""
+    turn: Float[Array, ""]
+    """Largest turn of a base or of a spherical joint from one state to the next [rad]. Past 0.3, a step is too long."""
 
     def __str__(self) -> str:
         bad, quantity = int(self.bad_step), QUANTITIES[int(self.bad_quantity)]
@@ -48,6 +50,7 @@ class Diagnosis:
             f"closures are open by {float(self.closures):.1e}; the scaled mass matrix has the condition number "
             f"{float(self.condition):.1e} ({Trust(int(self.trust)).name.lower()}), the closures the smallest "
             f"singular value {float(self.sigma_min):.1e}."
+            + (f" Something turns by {float(self.turn):.2g} rad a step; take shorter ones." if self.turn > 0.3 else "")
         )
 
 
@@ -89,6 +92,7 @@ def diagnose(
         condition=largest(condition, 1),
         trust=largest(trust, 0),
         sigma_min=-largest(-sigma, -1),
+        turn=largest(jnp.concatenate([jnp.zeros(1, qs.dtype), _turns(chain, qs)]), 0),
     )
 
 
@@ -108,6 +112,14 @@ def _of_state(chain, q, v, gravity):
         opening = jnp.abs(loop_residual(chain, q)).max()
         _, sigma, _ = closure_spectrum(chain, q)
     return quantity, momentum(chain, q, v), energy, opening, condition, trust, sigma
+
+
+def _turns(chain, qs):
+    """Largest angle between the quaternions of a state and of the next [nt - 1]."""
+    quats = jax.vmap(lambda q: quaternions_of(chain, q))(qs)
+    a, b = quats[1:], quats[:-1]
+    apart = jnp.minimum(((a - b) ** 2).sum(-1), ((a + b) ** 2).sum(-1))  # of unit quaternions: (2 sin(angle / 4))²
+    return 4 * jnp.arcsin(jnp.minimum(jnp.sqrt(apart) / 2, 1.0)).max(1, initial=0.0)
 
 
 def _potential(chain, q, gravity):

@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from sdyn.checks import FAR, RobotError, hat, is_physical, principal_moments
+from sdyn.heaviest import better_base
 from sdyn.posture import link_poses, turn
 from sdyn.robot import Robot
 
@@ -43,6 +44,9 @@ def examine(robot: Robot) -> tuple[Finding, ...]:
     found += [x for joint in robot.moving for x in _joint(joint)]
     found += [x for name, value in robot.locked.items() for x in _locked(robot.joint(name), value)]
     found += loose_joints(repaired(robot))
+    if better := better_base(robot):
+        wrong = f"is a base much lighter than link {better!r}, from which dynamics are computed instead"
+        found.append(Finding("note", f"link {robot.base!r}", wrong, f"leave it so; reroot({better!r}) is faster"))
     return tuple(sorted(found, key=lambda x: ("error", "warning", "note").index(x.level)))
 
 

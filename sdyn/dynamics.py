@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sdyn import aba as _aba
+from sdyn import rebase
 from sdyn.chain import Chain, LinkRow
 from sdyn.coordinates import gravity_of, join, pose_of, rates_of, spin, turned_columns
 from sdyn.crba import crba
@@ -31,6 +32,13 @@ def tree_dynamics(
         Featherstone (2008), section 7.3; derivatives by the implicit rule, see `aba.py`.
     """
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
+    if chain.inner is not None:
+        inner = rebase.inner_of(chain)
+        q, v = rebase.state_seen(chain, inner, q, v)
+        pose = pose_of(inner, q)
+        force = rebase.force_seen(chain, inner, pose, tau)
+        vdot = tree_dynamics(inner, q, v, force, gravity=gravity, f_ext=f_ext)
+        return rebase.acceleration_back(chain, inner, pose, v, vdot)
     pose, structure, G, F = operands_of(chain, q, gravity, f_ext)
     V0, qd = rates_of(chain, pose, v)
     f0, force = rates_of(chain, pose, tau)
@@ -103,6 +111,11 @@ def solve_mass(chain: Chain, q: Float[Array, " nq"], b: Float[Array, " nv"]) -> 
         b: Right-hand side, laid out as v.
     """
     q, b = expect(chain, q=q, b=b)
+    if chain.inner is not None:
+        inner = rebase.inner_of(chain)
+        q, _ = rebase.state_seen(chain, inner, q, jnp.zeros_like(b))
+        pose = pose_of(inner, q)
+        return rebase.rates_back(chain, inner, pose, solve_mass(inner, q, rebase.force_seen(chain, inner, pose, b)))
     pose, structure, _, _ = operands_of(chain, q, None, None)
     left = _aba.nothing_saved(chain.dtype)
     return join(chain, pose, *_aba.mass_solve(*structure, *left, *rates_of(chain, pose, b)))

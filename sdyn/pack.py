@@ -1,5 +1,6 @@
 """The gate: a robot of names and parts becomes a chain of arrays, in NumPy until one transfer to the device."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from sdyn.chain import BaseRow, Capacity, Chain, JointRow, JointValue, LinkRow, LoopRow, SlotRow
 from sdyn.checks import RobotError
 from sdyn.doctor import refuse_loose
+from sdyn.heaviest import better_base
 from sdyn.merge import derive
 from sdyn.parts import CLOSURES
 from sdyn.robot import GROUND, Robot
@@ -124,12 +126,13 @@ def _capacity_of(robots, width, padded, memory=MEMORY) -> Capacity:
         )
     union = lambda key: tuple(dict.fromkeys(part.name for robot in robots for part in getattr(robot, key)))
     links, joints, frames, loops = (union(key) for key in ("links", "joints", "frames", "loops"))
-    sizes = [_sizes(robot, len(schedule(_bodies(robot).parent, width))) for robot in robots]
+    others = [robot.reroot(base) for robot in robots if (base := better_base(robot))]
+    sizes = [_sizes(robot, len(schedule(_bodies(robot).parent, width))) for robot in (*robots, *others)]
     steps, nq, nv, quaternions, rows = (max(column) for column in zip(*sizes, strict=True))
     layout = "padded" if padded else "grounded" if robots[0].grounded else "free"
     return Capacity(
         max(steps, 1), width, len(links), len(joints), len(frames), nq, nv, quaternions, len(loops), rows, layout,
-        links, joints, frames, loops,
+        links, joints, frames, loops, bool(others),
     )  # fmt: skip
 
 
@@ -159,6 +162,8 @@ def _check_fits(robot, capacity, needs):
         raise RobotError("pack: the capacity is the exact one of another robot; use sdyn.capacity([...]).")
     have = capacity.steps, capacity.nq, capacity.nv, capacity.quaternions, capacity.rows
     kinds = "steps", "entries of q", "entries of v", "quaternions", "rows of closures"
+    if better_base(robot) and not capacity.rebased and capacity.layout == "padded":
+        raise RobotError(f"pack: base {robot.base!r} is too light, and the capacity has no room for another; {again}.")
     for what, need, room in zip(kinds, needs, have, strict=True):
         if need > room:
             raise RobotError(f"pack: the robot needs {need} {what} and the capacity has {room}; {again}.")
@@ -227,6 +232,9 @@ def _arrays(robot: Robot, capacity: Capacity, dtype) -> Chain:
         slot_index, slot_value, base_value, ancestors, link_index, mass, com, inertia, link_pose, joint_index,
         joint_value, dof_value, quat_index, dof_to_q, frame_index, frame_value, *loops, capacity,
     )  # fmt: skip
+    if capacity.rebased:
+        inner = _arrays(robot.reroot(better_base(robot) or robot.base), replace(capacity, rebased=False), dtype)
+        packed = replace(packed, inner=inner)
     with np.errstate(over="ignore"):
         packed = jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, packed)
     if not all(np.isfinite(x).all() for x in (packed.slot_value, packed.base_value, packed.link_inertia)):

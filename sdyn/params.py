@@ -51,7 +51,11 @@ def rederived(chain: Chain) -> Chain:
     inertial = chain.link_mass, chain.link_com, chain.link_inertia
     value, base, link_pose = derive(jnp, chain.slot_index, chain.link_index, chain.joint_value, *inertial)
     base_value = jnp.concatenate([base, chain.base_value[BaseRow.FREE:]])
-    return replace(chain, slot_value=value, base_value=base_value, link_pose=link_pose)
+    inner = chain.inner
+    if inner is not None:
+        keys = "link_mass", "link_com", "link_inertia", "joint_value"
+        inner = rederived(replace(inner, **{key: getattr(chain, key) for key in keys}))
+    return replace(chain, slot_value=value, base_value=base_value, link_pose=link_pose, inner=inner)
 
 
 def regressor(

@@ -12,7 +12,7 @@ import sdyn
 ROOT = Path(__file__).parents[1]
 # A file may import from files of the rows above it, and from files before it in its own row.
 HOST = [
-    ["checks", "tree", "table", "schedule"],
+    ["checks", "tree", "table", "schedule", "heaviest"],
     ["parts"],
     ["posture"],
     ["robot"],
@@ -25,7 +25,7 @@ DEVICE = [
     ["merge", "spatial", "rotation", "trigonometry"],
     ["pack", "sweep", "inputs", "coordinates"],
     ["rnea", "rnea_motion", "rnea_tangent", "rnea_adjoint", "rnea_derivatives", "rnea_jacobian", "crba", "aba"],
-    ["kinematics"],
+    ["kinematics", "rebase"],
     ["dynamics", "jacobians", "closures", "delassus", "partition", "constraints", "drift"],
     ["conditioning", "momentum", "params", "floating", "actuators"],
     ["transition", "rosenbrock", "variational", "integrate"],
