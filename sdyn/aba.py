@@ -17,27 +17,33 @@ import jax.numpy as jnp
 from jax import lax
 
 from sdyn.batching import Kernel
-from sdyn.chain import BaseRow
+from sdyn.chain import BaseRow, ValueRow
 from sdyn.materialise import keep
-from sdyn.rnea import body_forces, joint_forces
+from sdyn.rnea import force, newton_euler
 from sdyn.rnea_derivatives import slope
 from sdyn.rnea_motion import flat
-from sdyn.spatial import blocks_times, dot, hat, solve6
+from sdyn.spatial import blocks_of, blocks_outer, blocks_times, cat, dot, rigid_inertia, solve6
 from sdyn.sweep import (
     Bodies,
+    Joints,
     Walk,
     add_to,
+    advanced,
     at,
+    base_inertia,
     batch_of,
     block,
-    bodies_of,
+    body_of,
     eye,
     joints_of,
+    masses,
+    placed,
     put,
     put_step,
     take,
     walk_of,
 )
+from sdyn.workspace import Workspace
 
 LIGHT = 0.02
 """Share of the mass below which a free base is light. The inertia that it feels is a small difference of large ones,
@@ -52,92 +58,109 @@ class Factor(NamedTuple):
     Dinv: jnp.ndarray
     """U D⁻¹ [slots + 2, 6, B] and D⁻¹ [slots + 2, 1, B] of each slot."""
     base: jnp.ndarray
-    """Blocks A, H, M of the articulated inertia of the base [27, B]."""
+    """Blocks A, H, M of the articulated inertia of the base [21, B]."""
 
 
-def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F, *, saving=False, whole=False):
+def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F, *, work, saving=False):
     """Accelerations (a0 [6, B], qdd [nv, B]); the operands as of `newton_euler`, and the forces (f0, tau).
 
     With `saving`, also what `mass_solve` and the derivatives can use again: bodies [slots + 2, 19, B], factor
-    [slots + 2, 7, B] and that of the base [27, B].
+    [slots + 2, 7, B] and that of the base [21, B].
     """
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F)
-    free, walk = base_value[BaseRow.FREE], walk_of(slot_index, whole)
-    bodies, factor = _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B)
+    free, walk, structure = base_value[BaseRow.FREE], walk_of(slot_index, work), (slot_index, slot_value, base_value)
     held = -G * (1 - free) if G.shape[0] else jnp.zeros_like(V0)  # a free base falls with the rest
-    f = body_forces(walk, bodies, V0 * free, walk.by_step(qd), held, None, F, B)
-    f = f.at[walk.slots].add(-f0 * free)
-    a0, qdd = solve(walk, bodies.S, factor, f, walk.by_step(tau), free, rotor.shape[0])
+    joints = joints_of(walk, slot_index, slot_value, q, quat)
+    S, f, blocks, bodies = _loaded(walk, joints, base_value, V0 * free, qd, held, B, saving)
+    factor = articulated(walk, S, blocks, rotor, free, B)
+    a0, qdd = solve(walk, S, factor, f - F if F.shape[0] else f, f0 * free, tau, free, rotor.shape[0])
 
     def improved(x):
         """One step of refinement: x + M⁻¹ (τ − ID(x)), by the same factor."""
-        a0, qdd = x
-        start = a0 + held
-        f = body_forces(walk, bodies, V0 * free, walk.by_step(qd), start, walk.by_step(qdd), F, B)
-        found0, found = joint_forces(walk, bodies.S, f, len(qdd))
-        left = jnp.zeros_like(f).at[walk.slots].set((found0 - f0) * free)
-        rest = walk.by_step(tau - found - rotor * qdd)
-        return tuple(y + d for y, d in zip(x, solve(walk, bodies.S, factor, left, rest, free, len(qdd)), strict=True))
+        (a0, qdd), own = x, Workspace(work.whole)  # what is in a branch stays there
+        found0, found = newton_euler(*structure, rotor, q, quat, V0, qd, lifted(a0), qdd, G, F, work=own)
+        left, same = (f0 * free - found0, tau - found), walk._replace(work=own)
+        more = solve(same, S, factor, walk.zeros(6, B, f.dtype), *left, free, len(qdd))
+        return tuple(y + d for y, d in zip(x, more, strict=True))
 
-    light = bodies.m[walk.slots, 0] < LIGHT * bodies.m[:-1].sum((0, 1))
+    lifted = lambda a0: a0 + G * free if G.shape[0] else a0
+    m0, m = base_value[BaseRow.MASS], slot_value[:, ValueRow.MASS]
+    light = m0 < LIGHT * (m0 + m.sum((0, 1)))
     a0, qdd = lax.cond(jnp.any(light & (free == 1)), improved, lambda x: x, (a0, qdd))
-    a0 = a0 + G * free if G.shape[0] else a0
-    return (a0, qdd, flat(bodies), jnp.concatenate(factor[:2], 1), factor.base) if saving else (a0, qdd)
+    a0 = lifted(a0)
+    return (a0, qdd, flat(bodies), cat(factor[:2], 1), factor.base) if saving else (a0, qdd)
 
 
-def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, saved, factor, base, b0, b, *, whole=False):
+def _loaded(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving: bool):
+    """Axes S, forces at zero accelerations and blocks of the inertia of all bodies; these too, if `saving`."""
+    def values(V, A, m, h, Io):
+        own = (Io.reshape(9, *h.shape[1:]), h) if saving else ()
+        return (V, A, force((m, h, Io), V, A), *blocks_of(m, h, Io), *own)
+
+    def body(t, parents, R, p, S, stored):
+        V, A = (keep(take(x, parents)) for x in stored[:2])
+        V, A = advanced(V, A, S, walk.of_step(qd, t))
+        return values(V, A, *keep(rigid_inertia(R, p, *body_of(at(joints.value, t)))))
+
+    of_base = values(V0, A0, *base_inertia(base_value))
+    more = tuple(walk.empty(len(x), B, V0.dtype, x) for x in of_base)
+    _, _, S, V, A, f, *blocks = placed(walk, joints, B, body, more)
+    walk.work.release(V, A)
+    bodies = Bodies(S, *blocks[3:], masses(walk, joints, base_value)) if saving else None
+    return S, f, blocks[:3], bodies
+
+
+def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, saved, factor, base, b0, b, *, work):
     """x of M x = b, as (x0 [6, B], x [nv, B]); `saved`, `factor` and `base` are empty, or from the same M."""
-    walk, free, nv = walk_of(slot_index, whole), base_value[BaseRow.FREE], rotor.shape[0]
+    walk, free, nv = walk_of(slot_index, work), base_value[BaseRow.FREE], rotor.shape[0]
     if saved.shape[0]:
         S, factor = saved[:, :6], Factor(factor[:, :6], factor[:, 6:], base)
     else:
         B = batch_of(slot_value, base_value, rotor, q, quat, axes=2)
-        (S, *_), factor = _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B)
+        S, factor = _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B)
     B = batch_of(S, b0, b, axes=2)
-    f = walk.zeros(6, B, b0.dtype).at[walk.slots].set(-b0 * free)
-    return solve(walk, S, factor, f, walk.by_step(b), free, nv)
+    return solve(walk, S, factor, walk.zeros(6, B, b0.dtype), b0 * free, b, free, nv)
 
 
 def _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B):
+    """Axes S, and the factor."""
     joints = joints_of(walk, slot_index, slot_value, q, quat)
-    _, _, bodies = bodies_of(walk, joints, base_value, B)
-    return bodies, articulated(walk, bodies, rotor, base_value[BaseRow.FREE], B)
+
+    def body(t, parents, R, p, S, stored):
+        return blocks_of(*keep(rigid_inertia(R, p, *body_of(at(joints.value, t)))))
+
+    more = tuple(walk.empty(len(x), B, slot_value.dtype, x) for x in blocks_of(*base_inertia(base_value)))
+    _, _, S, *blocks = placed(walk, joints, B, body, more)
+    return S, articulated(walk, S, blocks, rotor, base_value[BaseRow.FREE], B)
 
 
-def articulated(walk: Walk, bodies: Bodies, rotor, free, B: tuple) -> Factor:
-    """The articulated inertias, and the factor that they give."""
-    W, dtype = walk.width, bodies.S.dtype
-    rotor = walk.by_step(rotor)
+def articulated(walk: Walk, S, blocks, rotor, free, B: tuple) -> Factor:
+    """The articulated inertias, from those of the bodies, and the factor that they give."""
+    W, axes, dtype = walk.width, S, S.dtype
 
     def inward(t, parents, stored):
-        *stored, Gs, Ds = stored
-        S = block(bodies.S, t, W)
-        A, H, M = (block(x, t, W).reshape(3, 3, W, *B) for x in stored)
-        U = keep(blocks_times(A, H, M, S))
-        D = keep(1 / (dot(S, U) + at(rotor, t)))
+        *IAs, Gs, Ds = stored
+        S, IA = block(axes, t, W), [block(x, t, W) for x in IAs]
+        U = keep(blocks_times(*IA, S))
+        D = keep(1 / (dot(S, U) + walk.of_step(rotor, t)))
         G = keep(U * D)
-        less = lambda X, a, b: (X - a[:, None] * b[None]).reshape(9, W, *B)
-        out = less(A, G[:3], U[:3]), less(H, G[:3], U[3:]), less(M, G[3:], U[3:])
-        added = (add_to(x, parents, y) for x, y in zip(stored, out, strict=True))
+        found = (x - y for x, y in zip(IA, blocks_outer(G, U), strict=True))
+        added = (add_to(x, parents, y) for x, y in zip(IAs, found, strict=True))
         return *added, put(Gs, t, W, G), put(Ds, t, W, D[None])
 
-    one, h = eye(dtype, *B).reshape(9, *B), hat(jnp.moveaxis(bodies.h, 1, 0))
-    blocks = bodies.Io, jnp.moveaxis(h.reshape(9, *h.shape[2:]), 0, 1), bodies.m * one
-    stored = *blocks, walk.zeros(6, B, dtype), walk.zeros(1, B, dtype)
-    *blocks, G, D = walk.inward(inward, stored)
-    held = one * (1 - free)  # a grounded base may have no mass
-    A, H, M = (x[walk.slots] for x in blocks)
-    return Factor(G, D, jnp.concatenate([A + held, H, M + held]))
+    *blocks, G, D = walk.inward(inward, (*blocks, walk.empty(6, B, dtype), walk.empty(1, B, dtype)))
+    massless = blocks_of(1 - free, jnp.zeros((3, *B), dtype), eye(dtype, *B) * (1 - free))  # as a grounded base may be
+    return Factor(G, D, cat([x[walk.slots] + y for x, y in zip(blocks, massless, strict=True)]))
 
 
-def solve(walk: Walk, S, factor: Factor, f, tau, free, nv: int):
-    """Accelerations (a0 [6, B], qdd [nv, B]) from the forces f of the bodies and tau [T, W, B]."""
-    W = walk.width
+def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int):
+    """Accelerations (a0 [6, B], qdd [nv, B]) from the forces f of the bodies, f0 on the base and tau [nv, B]."""
+    W, B = walk.width, f.shape[2:]
 
     def inward(t, parents, stored):
         f, us = stored
         here = keep(block(f, t, W))
-        u = keep(at(tau, t) - dot(block(S, t, W), here))
+        u = keep(walk.of_step(tau, t) - dot(block(S, t, W), here))
         return add_to(f, parents, here + block(factor.G, t, W) * u), put_step(us, t, u)
 
     def outward(t, parents, stored):
@@ -146,11 +169,9 @@ def solve(walk: Walk, S, factor: Factor, f, tau, free, nv: int):
         qdd = keep(at(u, t) * block(factor.Dinv, t, W)[0] - dot(block(factor.G, t, W), before))
         return put(a, t, W, before + block(S, t, W) * qdd), walk.put_dof(x, t, qdd)
 
-    f, u = walk.inward(inward, (f, jnp.broadcast_to(jnp.zeros_like(tau), (*tau.shape[:2], *f.shape[2:]))))
-    A, H, M = factor.base.reshape(3, 3, 3, *factor.base.shape[1:])
-    a0 = -solve6(A, H, M, f[walk.slots]) * free
-    start = jnp.zeros_like(f).at[walk.slots].set(a0)
-    return a0, walk.outward(outward, (start, walk.dofs(nv, f.shape[2:], f.dtype)))[1][:nv]
+    f, u = walk.inward(inward, (f, walk.work.empty((*walk.live.shape, *B), f.dtype)))
+    a0 = solve6(factor.base[:6], factor.base[6:15], factor.base[15:], f0 - f[walk.slots]) * free
+    return a0, walk.outward(outward, (walk.empty(6, B, f.dtype, a0), walk.dofs(nv, B, f.dtype)))[1][:nv]
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------

@@ -22,6 +22,8 @@ from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from sdyn.workspace import Workspace
+
 BLOCK = 128
 """Samples or columns that a CPU works on at once: long rows, and storage that fits the second cache."""
 
@@ -31,8 +33,7 @@ class Kernel:
 
     Args:
         fun: The function, differentiable by JAX unless `rule` is given. That of a grouped kernel gets arrays
-            `(..., columns, s)`. One with integer operands is called with `whole=True` where JAX will transpose it:
-            its loops must have fixed lengths then.
+            `(..., columns, s)`. One with integer operands is called with `work`, a `Workspace`.
         rule: `(primals, tangents) -> outputs, output tangents`, a tangent being None where it is zero.
         linear: Positions of operands in which `fun` is linear; with `transpose`, or by AD.
         transpose: `(operands, cotangents) -> cotangents of the linear operands`, which have None in their places.
@@ -47,16 +48,17 @@ class Kernel:
     def __call__(self, *operands):
         return tuple(_primitive.bind(*operands, kernel=self))
 
-    def apply(self, *operands, whole: bool):
+    def apply(self, *operands, work: Workspace):
         """`fun` of operands as it wants them."""
-        return self.fun(*operands, **({"whole": whole} if any(map(_is_index, operands)) else {}))
+        return self.fun(*operands, **({"work": work} if any(map(_is_index, operands)) else {}))
 
-    def run(self, *operands):
+    def run(self, *operands, work: Workspace | None = None):
         """The outputs, in one piece."""
+        work = work or Workspace()
         if not self.grouped:
-            return self.apply(*operands, whole=False)
+            return self.apply(*operands, work=work)
         s, B = _sizes(operands)
-        found = self.apply(*(_columns(x, s, B) for x in operands), whole=False)
+        found = self.apply(*(_columns(x, s, B) for x in operands), work=work)
         return tuple(jnp.broadcast_to(y, (*y.shape[:-2], B // s, s)).reshape(*y.shape[:-2], B) for y in found)
 
     @cached_property
@@ -121,30 +123,45 @@ def _blocked(*operands, kernel):
     b = _even(s, BLOCK)
     k = _even(B // s, max(1, BLOCK // b))
 
-    def body(i, out):
+    def part(x, corner):
+        if _is_index(x) or x.shape[-1] == 1:
+            return x
+        if x.shape[-1] == s:
+            return lax.dynamic_slice_in_dim(x, corner[1], b, x.ndim - 1)
+        at = (*(0,) * (x.ndim - 1), *corner)
+        return lax.dynamic_slice(_columns(x, s, B), at, (*x.shape[:-1], k, b)).reshape(*x.shape[:-1], k * b)
+
+    def body(i, carry):
+        out, stored = carry
         i, now = lax.optimization_barrier((i, operands))  # or XLA moves what all blocks share in front of the loop
         i, j = i // -(-s // b), i % -(-s // b)
         corner = jnp.minimum(i * k, B // s - k), jnp.minimum(j * b, s - b)
-
-        def part(x):
-            if _is_index(x) or x.shape[-1] == 1:
-                return x
-            if x.shape[-1] == s:
-                return lax.dynamic_slice_in_dim(x, corner[1], b, x.ndim - 1)
-            at = (*(0,) * (x.ndim - 1), *corner)
-            return lax.dynamic_slice(_columns(x, s, B), at, (*x.shape[:-1], k, b)).reshape(*x.shape[:-1], k * b)
+        work = Workspace(given=stored)
 
         def put(whole, y):
             y = y.reshape(*y.shape[:-1], k, b)
             return lax.dynamic_update_slice(whole, y, (*(0,) * (y.ndim - 2), *corner))
 
-        return tuple(put(x, y) for x, y in zip(out, kernel.run(*map(part, now)), strict=True))
+        found = kernel.run(*(part(x, corner) for x in now), work=work)
+        return tuple(put(x, y) for x, y in zip(out, found, strict=True)), tuple(work.storages)
 
-    blocks = -(-s // b) * -(-(B // s) // k)
+    def all_blocks(_, out):
+        stored = tuple(lax.empty(x.shape, x.dtype) for x in wanted)
+        return lax.fori_loop(0, blocks, body, (out, stored))[0]
+
+    wanted = _storages(kernel, [jax.eval_shape(part, x, (0, 0)) for x in operands])
+    blocks, one = -(-s // b) * -(-(B // s) // k), 1
     for index in filter(_is_index, operands):
-        blocks = jnp.where(index.ravel()[0] >= 0, blocks, 0)
+        blocks, one = jnp.where(index.ravel()[0] >= 0, blocks, 0), jnp.where(index.ravel()[0] >= 0, one, 0)
     empty = tuple(jnp.zeros((*x.shape[:-1], B // s, s), x.dtype) for x in shaped)
-    return tuple(y.reshape(x.shape) for x, y in zip(shaped, lax.fori_loop(0, blocks, body, empty), strict=True))
+    return tuple(y.reshape(x.shape) for x, y in zip(shaped, lax.fori_loop(0, one, all_blocks, empty), strict=True))
+
+
+def _storages(kernel, operands):
+    """Shapes and types of the storages that the kernel asks for."""
+    work = Workspace()
+    jax.eval_shape(lambda *x: kernel.run(*x, work=work), *operands)
+    return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in work.storages]
 
 
 def _even(n: int, most: int) -> int:
@@ -239,12 +256,12 @@ def _tangent(kernel, given) -> Kernel:
     n = len(given)
     positions = [i for i in range(n) if given[i]]
 
-    def fun(*operands, whole=False):
+    def fun(*operands, work=None):
         def f(*xs):
             full = list(operands[:n])
             for i, x in zip(positions, xs, strict=True):
                 full[i] = x
-            return tuple(kernel.apply(*full, whole=whole))
+            return tuple(kernel.apply(*full, work=Workspace(work is not None and work.whole)))
 
         # a batch may share the operand and not the tangent, or the other way round
         pairs = [jnp.broadcast_arrays(operands[i], t) for i, t in zip(positions, operands[n:], strict=True)]
@@ -282,7 +299,7 @@ def _adjoint(kernel, free, outputs: int) -> Kernel:
     given = [i for i, f in enumerate(free) if not f]
     wanted = [i for i, f in enumerate(free) if f]
 
-    def fun(*operands, whole=True):
+    def fun(*operands, work=None):
         full = [None] * len(free)
         for i, x in zip(given, operands, strict=False):
             full[i] = x
@@ -294,7 +311,7 @@ def _adjoint(kernel, free, outputs: int) -> Kernel:
             at = list(full)
             for i, x in zip(wanted, xs, strict=True):
                 at[i] = x
-            return tuple(kernel.apply(*at, whole=True))
+            return tuple(kernel.apply(*at, work=Workspace(whole=True)))
 
         cotangents = operands[len(free) :]
         wide = [jnp.broadcast_to(c, y.shape) for c, y in zip(cotangents, jax.eval_shape(f, *like), strict=True)]

@@ -23,9 +23,9 @@ from sdyn.sweep import (
 )
 
 
-def _crba(slot_index, ancestors, slot_value, base_value, rotor, q, quat, *, whole=False):
+def _crba(slot_index, ancestors, slot_value, base_value, rotor, q, quat, *, work):
     """M [6 + nv, 6 + nv, B], the base block first and zero when the base is grounded."""
-    walk = walk_of(slot_index, whole)
+    walk = walk_of(slot_index, work)
     W, slots, nv = walk.width, walk.slots, rotor.shape[0]
     B, dtype = batch_of(slot_value, base_value, rotor, q, quat), slot_value.dtype
     joints = joints_of(walk, slot_index, slot_value, q, quat)

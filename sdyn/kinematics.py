@@ -17,19 +17,19 @@ from sdyn.spatial import cat
 from sdyn.sweep import batch_of, joints_of, moved, placed, walk_of
 
 
-def _poses(slot_index, slot_value, q, quat, *, whole=False):
+def _poses(slot_index, slot_value, q, quat, *, work):
     """Rotation and position [slots + 2, 12, B], motion subspace [slots, 6, B], in base axes."""
-    walk, B = walk_of(slot_index, whole), batch_of(slot_value, q, quat)
+    walk, B = walk_of(slot_index, work), batch_of(slot_value, q, quat)
     R, p, S = placed(walk, joints_of(walk, slot_index, slot_value, q, quat), B)
-    return cat([R, p], 1), S[: walk.slots]
+    return walk.cleared(cat([R, p], 1)), walk.cleared(S)[: walk.slots]
 
 
-def _motions(slot_index, slot_value, q, quat, V0, qd, A0, qdd, *, whole=False):
+def _motions(slot_index, slot_value, q, quat, V0, qd, A0, qdd, *, work):
     """Rotation, position, twist and spatial acceleration [slots + 2, 24, B], in base axes."""
-    walk, B = walk_of(slot_index, whole), batch_of(slot_value, q, quat, V0, qd, A0, qdd)
+    walk, B = walk_of(slot_index, work), batch_of(slot_value, q, quat, V0, qd, A0, qdd)
     R, p, S = placed(walk, joints_of(walk, slot_index, slot_value, q, quat), B)
-    V, A = moved(walk, S, V0, walk.by_step(qd), A0, walk.by_step(qdd), B)
-    return (cat([R, p, V, A], 1),)
+    V, A = moved(walk, S, V0, qd, A0, qdd, B)
+    return (walk.cleared(cat([R, p, V, A], 1)),)
 
 
 poses = Kernel(_poses)

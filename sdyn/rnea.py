@@ -25,18 +25,18 @@ from sdyn.sweep import (
 )
 
 
-def newton_euler(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F, *, whole=False):
+def newton_euler(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F, *, work):
     """Forces (f0 [6, B], tau [nv, B]) that cause the accelerations (a0, qdd).
 
     V0, a0: twist of the base, and the derivative of its components [6, B]. G: [0; gravity] in base axes [6, B], or
     empty. F: wrenches on the slots, base axes and origin [slots + 2, 6, B], or empty.
     """
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, a0, qdd, G, F)
-    free, walk = base_value[BaseRow.FREE], walk_of(slot_index, whole)
+    free, walk = base_value[BaseRow.FREE], walk_of(slot_index, work)
     joints = joints_of(walk, slot_index, slot_value, q, quat)
     _, _, bodies = bodies_of(walk, joints, base_value, B)
     A0 = a0 * free - G if G.shape[0] else a0 * free
-    f = body_forces(walk, bodies, V0 * free, walk.by_step(qd), A0, walk.by_step(qdd), F, B)
+    f = body_forces(walk, bodies, V0 * free, qd, A0, qdd, F, B)
 
     f0, tau = joint_forces(walk, bodies.S, f, rotor.shape[0])
     return f0 * free, tau + rotor * qdd
@@ -55,11 +55,12 @@ def joint_forces(walk: Walk, S, f, nv: int):
 
 
 def body_forces(walk: Walk, bodies: Bodies, V0, qd, A0, qdd, F, B: tuple):
-    """The force on each body that makes it move so [slots + 2, 6, B]; without `qdd`, at zero accelerations."""
+    """The force on each body that makes it move so [slots + 2, 6, B]."""
     each = lambda t, V, A: (force(inertia_at(bodies, t, walk.width), V, A),)
     f0 = force(inertia_of_base(walk, bodies), V0, A0)
-    stored = walk.zeros(6, B, bodies.S.dtype).at[walk.slots].set(f0)
-    _, _, f = moved(walk, bodies.S, V0, qd, A0, qdd, B, each, (stored,))
+    stored = walk.empty(6, B, bodies.S.dtype, f0)
+    V, A, f = moved(walk, bodies.S, V0, qd, A0, qdd, B, each, (stored,))
+    walk.work.release(V, A)
     return f - F if F.shape[0] else f
 
 

@@ -24,31 +24,31 @@ from sdyn.spatial import transposed as tr
 from sdyn.sweep import Walk, add_to, at, batch_of, block, body_of, inertia_at, inertia_of_base, put, take
 
 
-def adjoint(*operands, parameters, whole=False):
+def adjoint(*operands, parameters, work):
     """Gradient of c0 · f0 + c · τ with respect to all operands but `slot_index` and `saved`, in their order.
 
     Without `parameters`, those of slot_value and base_value are empty.
     """
     x, (c0, c) = dict(zip(OPERANDS, operands, strict=False)), operands[len(OPERANDS) :]
     spherical, wrench = x["quat"].shape[0] > 0, x["F"].shape[0] > 0
-    motion = motion_of(x, parameters or spherical, whole)
+    motion = motion_of(x, parameters or spherical, work)
     walk, bodies, W, nv = motion.walk, motion.bodies, motion.walk.width, x["rotor"].shape[0]
     B = batch_of(*(operands[k] for k in range(1, len(operands)) if k != 12), axes=2)
     free = x["base_value"][BaseRow.FREE]
-    dtype, cs, w0 = free.dtype, walk.by_step(c), c0 * free
+    dtype, w0 = free.dtype, c0 * free
 
     def local(inertia, V, IV, w):
         IVw = keep(inertia_times(*inertia, keep(motion_cross(V, w))))
         return keep(inertia_times(*inertia, w)), -keep(force_cross(w, IV)) - IVw
 
     def outward(t, parents, stored):
-        w = keep(take(stored[0], parents) + block(bodies.S, t, W) * at(cs, t))
+        w = keep(take(stored[0], parents) + block(bodies.S, t, W) * walk.of_step(c, t))
         here = local(inertia_at(bodies, t, W), block(motion.V, t, W), block(motion.IV, t, W), w)
         return tuple(put(y, t, W, z) for y, z in zip(stored, (w, *here), strict=True))
 
     at_base = local(inertia_of_base(walk, bodies), motion.V[walk.slots], motion.IV[walk.slots], w0)
-    start = (walk.zeros(6, B, dtype).at[walk.slots].set(y) for y in (w0, *at_base))
-    ws, As, Bs = walk.outward(outward, tuple(start))
+    start = tuple(walk.empty(6, B, dtype, y) for y in (w0, *at_base))
+    ws, As, Bs = walk.outward(outward, start)
     f, T = motion.f, ()
     if wrench:
         moment = force_cross(*(jnp.moveaxis(y, 1, 0) for y in (ws, jnp.broadcast_to(x["F"], ws.shape))))
@@ -56,7 +56,7 @@ def adjoint(*operands, parameters, whole=False):
 
     def inward(t, parents, stored):
         f, As, Bs, *T, of_q, of_qd, of_qdd, more = stored
-        S, qd = block(bodies.S, t, W), at(motion.qd, t)
+        S, qd = block(bodies.S, t, W), walk.of_step(motion.qd, t)
         fh, A, Bv, *Th = (keep(block(y, t, W)) for y in (f, As, Bs, *T))
         w, V, a = (keep(take(y, parents)) for y in (ws, motion.V, motion.A))
         up = keep(Bv + keep(force_cross(S * qd, A)))
@@ -64,7 +64,7 @@ def adjoint(*operands, parameters, whole=False):
         g = -(g + Th[0]) if wrench else -g
         b = keep(Bv - keep(force_cross(V, A)))
         if more:
-            of_S = keep(at(cs, t) * fh + qd * b + at(motion.qdd, t) * A)
+            of_S = keep(walk.of_step(c, t) * fh + qd * b + walk.of_step(motion.qdd, t) * A)
             found = [_geometry(motion, t, parents, g, of_S)]
             found += [_inertial(motion, t, block(ws, t, W))] if parameters else []
             more = tuple(put(y, t, W, z) for y, z in zip(more, found, strict=True))
@@ -74,16 +74,16 @@ def adjoint(*operands, parameters, whole=False):
 
     empty = walk.dofs(nv, B, dtype)
     more = (42, 13) if parameters else (42,) if spherical else ()
-    more = tuple(walk.zeros(k, B, dtype) for k in more)
+    more = tuple(walk.empty(k, B, dtype) for k in more)
     f, As, Bs, *T, of_q, of_qd, of_qdd, more = walk.inward(inward, (f, As, Bs, *T, empty, empty, empty, more))
     none = jnp.zeros((0, *B), dtype)
     of_quat = _of_quaternions(x, walk, more[0][:, 39:]) if spherical else none[:, None]
     A0, V0 = As[walk.slots], Bs[walk.slots] * free
     of_G = -A0 if x["G"].shape[0] else none
-    of_F = -ws if wrench else none[:, None, None]
+    of_F = -walk.cleared(ws) if wrench else none[:, None, None]
     of_slot, of_base = none[:, None, None, None], none
     if parameters:
-        rows = cat([more[0][: walk.slots, :39], more[1][: walk.slots]], 1)
+        rows = walk.cleared(cat([more[0][:, :39], more[1]], 1))[: walk.slots]
         of_slot = jnp.swapaxes(rows.reshape(*walk.parent.shape, 52, *B), 1, 2)
         of_base = _of_base(x["base_value"], w0, motion.V[walk.slots], motion.A[walk.slots])
     return (
@@ -101,14 +101,14 @@ def _geometry(motion: Motion, t, parents, g, of_S):
     joints, W = motion.joints, motion.walk.width
     frame = lambda y: y.reshape(3, 3, *y.shape[1:])
     Rp, R, p = frame(take(motion.R, parents)), frame(block(motion.R, t, W)), block(motion.p, t, W)
-    turn = keep(g[:3] - cross(p, g[3:]))
+    turn, (q, _, sin, cos) = keep(g[:3] - cross(p, g[3:])), joints.turned(t)
     of_L = keep(mm(tr(Rp), mm(hat(turn), R))) / 2
     if joints.quat is not None:
         of_L = mm(of_L, tr(at(joints.quat, t)))
     of_L = of_L.reshape(9, *of_L.shape[2:])
     offset = mtv(Rp, g[3:])
     axis = mtv(R, of_S[:3] + cross(of_S[3:], p)), mtv(R, of_S[3:])
-    parts = of_L, of_L * at(joints.cos, t), of_L * at(joints.sin, t), offset, offset * at(joints.q, t), *axis
+    parts = of_L, of_L * cos, of_L * sin, offset, offset * q, *axis
     return keep(cat([*parts, mtv(R, turn)]))
 
 

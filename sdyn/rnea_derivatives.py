@@ -38,7 +38,7 @@ def _plain(kernel: Kernel):
 def rnea_adjoint(parameters: bool) -> Kernel:
     """The kernel of the cotangents."""
     n = len(OPERANDS)
-    fun = lambda *operands, whole=False: adjoint(*operands, parameters=parameters, whole=whole)
+    fun = lambda *operands, work: adjoint(*operands, parameters=parameters, work=work)
 
     def transpose(operands, cotangents):
         given = [(k, x) for k, x in zip(OPERANDS[1:12], cotangents, strict=True) if x.size]
@@ -53,7 +53,7 @@ def rnea_adjoint(parameters: bool) -> Kernel:
 def rnea_tangent(given: tuple[str, ...]) -> Kernel:
     """The kernel of the tangents along the operands named, which come last."""
     n, some = len(OPERANDS), len(given)
-    fun = lambda *operands, whole=False: tangent(*operands, given=given, whole=whole)
+    fun = lambda *operands, work: tangent(*operands, given=given, work=work)
 
     def transpose(operands, cotangents):
         found = rnea_adjoint(any(k in ("slot_value", "base_value") for k in given))(*operands[:n], *cotangents)

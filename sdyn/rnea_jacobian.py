@@ -19,13 +19,13 @@ from sdyn.chain import BaseRow, SlotRow
 from sdyn.materialise import keep
 from sdyn.rnea_motion import OPERANDS, Motion, motion_of
 from sdyn.spatial import cat, force_cross, inertia_times, motion_cross
-from sdyn.sweep import Bodies, add_to, at, block, inertia_at, inertia_of_base, put, take
+from sdyn.sweep import Bodies, add_to, block, inertia_at, inertia_of_base, put, take
 
 
-def _jacobian(ancestors, *operands, whole=False):
+def _jacobian(ancestors, *operands, work):
     """Derivatives [6 + nv, 6 + nv, B] of (f0, tau) by increments of (attitude, position, joints), and by (V0, qd)."""
     x = dict(zip(OPERANDS, operands, strict=True))
-    motion, free, nv = motion_of(x, False, whole, axes=1), x["base_value"][BaseRow.FREE], x["rotor"].shape[0]
+    motion, free, nv = motion_of(x, False, work, axes=1), x["base_value"][BaseRow.FREE], x["rotor"].shape[0]
     slots, dtype, B = motion.walk.slots, free.dtype, motion.V.shape[2:]
     (S, P, Q, z, W, of_q, of_v), IC0, C0 = _composites(motion)
 
@@ -78,7 +78,7 @@ def _composites(motion: Motion):
         CC = sums[4].reshape(6, 6, W, *B)
         columns = lambda y: keep(sum(CC[:, k] * y[k] for k in range(6)))
         w = keep(motion_cross(V, S))
-        z = keep(motion_cross(take(motion.A, parents), S)) + keep(motion_cross(w, S * at(motion.qd, t) - V))
+        z = keep(motion_cross(take(motion.A, parents), S)) + keep(motion_cross(w, S * walk.of_step(motion.qd, t) - V))
         of_q = keep(force_cross(S, total)) + keep(inertia_times(*IC, keep(z))) + columns(w)
         of_v = 2 * keep(inertia_times(*IC, w)) + columns(S)
         Q = sum(CC[k] * S[k] for k in range(6))
@@ -89,10 +89,10 @@ def _composites(motion: Motion):
     base = coriolis(inertia_of_base(walk, bodies), motion.V[walk.slots], motion.IV[walk.slots])
     C = walk.zeros(36, B, dtype).at[walk.slots].set(base.reshape(36, *B))
     wide = jnp.broadcast_to(bodies.m, (walk.slots + 2, 1, *B))
-    stored = wide, bodies.h, bodies.Io, motion.f, C, *(walk.zeros(6, B, dtype) for _ in range(7))
+    stored = wide, bodies.h, bodies.Io, motion.f, C, *(walk.empty(6, B, dtype) for _ in range(7))
     m, h, Io, _, C, *kept = walk.inward(inward, stored)
     IC0 = widened(inertia_of_base(walk, Bodies(bodies.S, Io, h, m)))
-    return [y[: walk.slots] for y in kept], IC0, C[walk.slots].reshape(6, 6, *B)
+    return [walk.cleared(y)[: walk.slots] for y in kept], IC0, C[walk.slots].reshape(6, 6, *B)
 
 
 def widened(inertia):

@@ -21,16 +21,16 @@ from sdyn.spatial import transposed as tr
 from sdyn.sweep import add_to, at, base_inertia, batch_of, block, body_of, inertia_at, inertia_of_base, put, take
 
 
-def tangent(*operands, given, whole=False):
+def tangent(*operands, given, work):
     """(df0 [6, B], dtau [nv, B]) along tangents of the operands named."""
     x, d = dict(zip(OPERANDS, operands, strict=False)), dict(zip(given, operands[len(OPERANDS) :], strict=True))
     moving = [k for k in given if k in ("q", *GEOMETRY)]
-    motion = motion_of(x, any(k in GEOMETRY for k in given), whole)
+    motion = motion_of(x, any(k in GEOMETRY for k in given), work)
     walk, bodies, W, nv = motion.walk, motion.bodies, motion.walk.width, x["rotor"].shape[0]
     B = batch_of(*(operands[k] for k in range(1, len(operands)) if k != 12), axes=2)
     free = x["base_value"][BaseRow.FREE]
-    dq, dqd, dqdd = (walk.by_step(d[k]) if k in d else None for k in ("q", "qd", "qdd"))
-    zero = walk.zeros(6, B, free.dtype)
+    of = lambda k, t: walk.of_step(d[k], t)
+    zero = jnp.zeros((6, *B), free.dtype)
     local = _displacements(x, d, motion, B) if [k for k in moving if k in GEOMETRY] else None
     heavier = _inertia_changes(d["slot_value"], motion) if "slot_value" in d else None
 
@@ -45,18 +45,18 @@ def tangent(*operands, given, whole=False):
     def outward(t, parents, stored):
         xis, dVs, dAs, *_ = stored
         S, V, A, IV, f = (block(y, t, W) for y in (bodies.S, motion.V, motion.A, motion.IV, motion.f))
-        qd, qdd = at(motion.qd, t), at(motion.qdd, t)
+        qd, qdd = walk.of_step(motion.qd, t), walk.of_step(motion.qdd, t)
         xi, dS = keep(take(xis, parents)), 0 * S
         if local:
             shift, direct = local(t, parents)
             xi = keep(xi + shift)
         if moving:
             dS = keep(motion_cross(xi, S) + direct if local else motion_cross(xi, S))
-            xi = keep(xi + S * at(dq, t)) if dq is not None else xi
-        dSqd = keep(dS * qd if dqd is None else dS * qd + S * at(dqd, t))
+            xi = keep(xi + S * of("q", t)) if "q" in d else xi
+        dSqd = keep(dS * qd + S * of("qd", t) if "qd" in d else dS * qd)
         dV = keep(take(dVs, parents) + dSqd)
         dA = take(dAs, parents) + keep(motion_cross(dV, S * qd)) + keep(motion_cross(V, dSqd)) + dS * qdd
-        dA = keep(dA if dqdd is None else dA + S * at(dqdd, t))
+        dA = keep(dA + S * of("qdd", t) if "qdd" in d else dA)
         change = heavier(t) if heavier else None
         df = body_force(xi, dV, dA, V, A, IV, f, inertia_at(bodies, t, W), change)
         return tuple(put(y, t, W, z) for y, z in zip(stored, (xi, dV, dA, dS + 0 * dV, df), strict=True))
@@ -67,17 +67,16 @@ def tangent(*operands, given, whole=False):
         found = dot(block(dSs, t, W), total) + dot(block(bodies.S, t, W), here)
         return add_to(f, parents, total), add_to(df, parents, here), walk.put_dof(dtau, t, found)
 
-    dV0 = d["V0"] * free if "V0" in d else zero[0]
-    dA0 = d["a0"] * free if "a0" in d else zero[0]
+    dV0 = d["V0"] * free if "V0" in d else zero
+    dA0 = d["a0"] * free if "a0" in d else zero
     dA0 = dA0 - d["G"] if "G" in d and d["G"].shape[0] else dA0
     rest = (y[walk.slots] for y in (motion.V, motion.A, motion.IV, motion.f))
     change = None
     if "base_value" in d:
         value, along = jnp.broadcast_arrays(x["base_value"], d["base_value"])
         _, change = jax.jvp(base_inertia, (value,), (along,))
-        change = tuple(y[..., 0, :, :] for y in change)
-    df0 = body_force(zero[0], dV0, dA0, *rest, inertia_of_base(walk, bodies), change)
-    start = (zero, zero.at[walk.slots].set(dV0), zero.at[walk.slots].set(dA0), zero, zero.at[walk.slots].set(df0))
+    df0 = body_force(zero, dV0, dA0, *rest, inertia_of_base(walk, bodies), change)
+    start = tuple(walk.empty(6, B, free.dtype, y) for y in (zero, dV0, dA0, zero, df0))
     _, _, _, dSs, df = walk.outward(outward, start)
     f = motion.f - x["F"] if x["F"].shape[0] else motion.f
     df = df - d["F"] if "F" in d and d["F"].shape[0] else df
@@ -100,9 +99,9 @@ def _displacements(x, d, motion: Motion, B):
         if turned is not None:
             theta = theta + mv(R, at(turned, t))
         if change is not None:
-            dC, q = at(change, t), at(joints.q, t)
-            dL = dC[:9] + dC[9:18] * at(joints.cos, t) + dC[18:27] * at(joints.sin, t)
-            s = mm(frame(dL), tr(frame(at(joints.turn, t))))  # dL Lᵀ = hat(theta)
+            dC, (q, turn, sin, cos) = at(change, t), joints.turned(t)
+            dL = dC[:9] + dC[9:18] * cos + dC[18:27] * sin
+            s = mm(frame(dL), tr(turn))  # dL Lᵀ = hat(theta)
             spin = jnp.stack([s[2, 1] - s[1, 2], s[0, 2] - s[2, 0], s[1, 0] - s[0, 1]]) / 2
             theta = theta + mv(Rp, spin)
             shift = shift + mv(Rp, dC[ValueRow.POINT : ValueRow.SLIDE] + dC[ValueRow.SLIDE : ValueRow.AXIS] * q)

@@ -74,15 +74,42 @@ def inertia_times(m, h, Io, V):
     return cat([mv(Io, V[:3]) + cross(h, V[3:]), m * V[3:] - cross(h, V[:3])])
 
 
+PACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+"""Where the entries of a symmetric 3 x 3 matrix are among the six of its upper triangle."""
+
+
+def blocks_of(m, h, Io):
+    """Spatial inertia as A [6, ...], H [9, ...], M [6, ...] of [[A, H], [Hᵀ, M]], A and M packed."""
+    o = jnp.zeros_like(h[:1])
+    m = m + o
+    return cat([Io[0], Io[1, 1:], Io[2, 2:]]), hat(h).reshape(9, *h.shape[1:]), cat([m, o, o, m, o, m])
+
+
 def blocks_times(A, H, M, V):
     """[[A, H], [Hᵀ, M]] V."""
-    w, v = V[:3], V[3:]
-    return cat([mv(A, w) + mv(H, v), mtv(H, w) + mv(M, v)])
+    w, v, H = V[:3], V[3:], H.reshape(3, 3, *H.shape[1:])
+    return cat([packed_times(A, w) + mv(H, v), mtv(H, w) + packed_times(M, v)])
+
+
+def packed_times(X, x):
+    """X x of a packed symmetric matrix."""
+    return jnp.stack([X[i] * x[0] + X[j] * x[1] + X[k] * x[2] for i, j, k in PACKED])
+
+
+def blocks_outer(a, b):
+    """The blocks of a bᵀ, where that is symmetric."""
+    packed = lambda a, b: keep(cat([a[0] * b, a[1] * b[1:], a[2] * b[2:]]))
+    H = a[:3, None] * b[None, 3:]
+    return packed(a[:3], b[:3]), H.reshape(9, *a.shape[1:]), packed(a[3:], b[3:])
 
 
 def solve6(A, H, M, b):
     """x of [[A, H], [Hᵀ, M]] x = b, positive definite, by an unrolled L D Lᵀ."""
-    K = lambda i, j: A[i, j] if i < 3 else (H[j, i - 3] if j < 3 else M[i - 3, j - 3])  # lower triangle, i >= j
+
+    def K(i, j):  # of the lower triangle, i >= j
+        packed = lambda X, i, j: X[PACKED[i][j]]
+        return packed(A, i, j) if i < 3 else H[3 * j + i - 3] if j < 3 else packed(M, i - 3, j - 3)
+
     L, E = {}, {}  # E = L D
     Di, y, x = {}, {}, {}
     for j in range(6):

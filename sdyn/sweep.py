@@ -11,6 +11,7 @@ used; a parent's value that several operations read is stored too, or XLA copies
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -20,6 +21,7 @@ from sdyn.materialise import keep
 from sdyn.rotation import matrix
 from sdyn.spatial import cat, cross, mm, motion_cross, mv, rigid_inertia
 from sdyn.trigonometry import sin_cos
+from sdyn.workspace import Workspace
 
 
 def batch_of(*operands, axes: int = 1) -> tuple[int, ...]:
@@ -40,6 +42,8 @@ class Walk(NamedTuple):
     """Degree of freedom, and whether there is a body [T, W]."""
     steps: int | jnp.ndarray
     """How many steps to take: those that hold bodies, which is data; all, a number, where JAX transposes the sweep."""
+    work: Workspace
+    """Where storages come from."""
 
     @property
     def width(self) -> int:
@@ -53,26 +57,41 @@ class Walk(NamedTuple):
 
     def outward(self, body, stored):
         """Storage after `body(t, parents, stored) -> stored` in every step, from the base to the tips."""
-        return lax.fori_loop(0, self.steps, lambda t, x: body(t, self._parents(t), x), stored)
+        return self._loop(lambda i: i, body, stored)
 
     def inward(self, body, stored):
         """The same, from the tips to the base."""
-        step = lambda i: self.steps - 1 - i
-        return lax.fori_loop(0, self.steps, lambda i, x: body(step(i), self._parents(step(i)), x), stored)
+        return self._loop(lambda i: self.steps - 1 - i, body, stored)
 
-    def _parents(self, t):
-        return keep(at(self.parent, t))
+    def _loop(self, step, body, stored):
+        def run(i, stored):
+            t = step(i)
+            return body(t, keep(at(self.parent, t)), stored)
+
+        found = lax.fori_loop(0, self.steps, run, stored)
+        return jax.tree.map(self.work.updated, stored, found)
+
+    def empty(self, components: int, B: tuple, dtype, base=0, dummy=0):
+        """Storage by slot without values, but for those of the base and of the dummy [components, *B]."""
+        x = self.work.empty((self.slots + 2, components, *B), dtype)
+        return self.work.updated(x, x.at[self.slots].set(base).at[self.slots + 1].set(dummy))
+
+    def cleared(self, x):
+        """A storage with zeros where there is no body, for others to read."""
+        there = jnp.append(self.live.reshape(-1), jnp.array([True, True]))  # the base and the dummy have values
+        return jnp.where(there.reshape(-1, *(1,) * (x.ndim - 1)), x, 0)
 
     def zeros(self, components: int, B: tuple, dtype):
-        """Empty storage by slot."""
+        """Storage by slot, zero."""
         zero = keep(jnp.zeros((), dtype))  # one of its own: XLA would fill one storage and copy it to the others
         return jnp.broadcast_to(zero, (self.slots + 2, components, *B))
 
-    def by_step(self, x):
-        """Values of the degrees of freedom (nv, B), laid out by slot (T, W, B), zero in empty slots."""
+    def of_step(self, x, t):
+        """Values (W, *B) of the degrees of freedom of step t, from those of all (nv, *B); zero in empty slots."""
         if x.shape[0] == 0:
-            return jnp.zeros((*self.live.shape, *x.shape[1:]), x.dtype)
-        return keep(jnp.take(x, self.dof, axis=0) * self._mask(x.ndim - 1).astype(x.dtype))
+            return jnp.zeros((self.width, *x.shape[1:]), x.dtype)
+        live = at(self.live, t).reshape(-1, *(1,) * (x.ndim - 1))
+        return keep(jnp.stack([at(x, k) for k in keep(at(self.dof, t))]) * live.astype(x.dtype))
 
     def dofs(self, nv: int, B: tuple, dtype):
         """Empty storage by degree of freedom; its last row is nobody's."""
@@ -84,16 +103,12 @@ class Walk(NamedTuple):
             stored = lax.dynamic_update_index_in_dim(stored, x[w], k, 0, allow_negative_indices=False)
         return stored
 
-    def _mask(self, axes: int):
-        """`live`, to broadcast against so many batch axes."""
-        return self.live.reshape(*self.live.shape, *(1,) * axes)
 
-
-def walk_of(slot_index, whole: bool = False) -> Walk:
-    """The order of the bodies; `whole` takes all steps of the capacity."""
+def walk_of(slot_index, work: Workspace) -> Walk:
+    """The order of the bodies."""
     live = slot_index[SlotRow.LIVE] == 1
-    steps = live.shape[0] if whole else jnp.any(live, 1).sum(dtype=jnp.int32)
-    return Walk(slot_index[SlotRow.PARENT], slot_index[SlotRow.DOF], live, steps)
+    steps = live.shape[0] if work.whole else jnp.any(live, 1).sum(dtype=jnp.int32)
+    return Walk(slot_index[SlotRow.PARENT], slot_index[SlotRow.DOF], live, steps, work)
 
 
 def at(x, t):
@@ -141,17 +156,21 @@ def _corner(stored, first):
 class Joints(NamedTuple):
     """Of the joint of each slot, by step."""
 
+    walk: Walk
     value: jnp.ndarray
     """Its constants, see `Chain.slot_value` [T, 52, W, B]."""
     q: jnp.ndarray
-    sin: jnp.ndarray
-    cos: jnp.ndarray
-    """Coordinate, its sine and cosine [T, W, B]."""
-    turn: jnp.ndarray
-    offset: jnp.ndarray
-    """Rotation [T, 9, W, B] and position [T, 3, W, B] in the slot of the parent."""
+    """Coordinates of the degrees of freedom [nv, B]."""
     quat: jnp.ndarray | None
     """Rotation of the spherical joint that starts in a slot, identity elsewhere [T, 3, 3, W, B]."""
+
+    def turned(self, t):
+        """The coordinates q of step t [W, B], the rotations that they cause [3, 3, W, B], sin q and cos q."""
+        c0, c1, c2 = (at(self.value, t)[k : k + 9] for k in (ValueRow.C0, ValueRow.C1, ValueRow.C2))
+        q = self.walk.of_step(self.q, t)
+        sin, cos = keep(sin_cos(q))
+        turn = keep(c0 + c1 * cos + c2 * sin)
+        return q, turn.reshape(3, 3, *turn.shape[1:]), sin, cos
 
 
 class Bodies(NamedTuple):
@@ -166,35 +185,25 @@ class Bodies(NamedTuple):
 
 
 def joints_of(walk: Walk, slot_index, slot_value, q, quat) -> Joints:
-    """The joint constants and coordinates of each step; what does not depend on the parent is done at once."""
-    qs = walk.by_step(q)
-    sin, cos = keep(sin_cos(qs))
-    part = lambda first, last: slot_value[:, first:last]
-    c0, c1, c2 = (part(k, k + 9) for k in (ValueRow.C0, ValueRow.C1, ValueRow.C2))
-    turn = keep(c0 + c1 * cos[:, None] + c2 * sin[:, None])
-    offset = part(ValueRow.POINT, ValueRow.SLIDE) + part(ValueRow.SLIDE, ValueRow.AXIS) * qs[:, None]
+    """The joints, of constants and coordinates."""
     R = None
     if quat.shape[0]:
         one = eye(quat.dtype, 1, *quat.shape[2:])
         rotations = cat([matrix(jnp.swapaxes(quat, 0, 1)), one], 2)
         R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[SlotRow.QUAT], axis=2), 2, 0))
-    return Joints(slot_value, qs, sin, cos, turn, offset, R)
+    return Joints(walk, slot_value, q, R)
 
 
 def place(joints: Joints, t, Rp, pp):
     """Rotation, position and motion subspace S of the bodies of step t, from their parents' R [3, 3, W, B] and p."""
-    axis = at(joints.value, t)[ValueRow.AXIS : ValueRow.MASS]
-    R = keep(mm(Rp, at(joints.turn, t).reshape(3, 3, *joints.turn.shape[2:])))
+    value, (q, turn, *_) = at(joints.value, t), joints.turned(t)
+    R = keep(mm(Rp, turn))
     if joints.quat is not None:
         R = keep(mm(R, at(joints.quat, t)))
-    p = keep(pp + mv(Rp, at(joints.offset, t)))
+    p = keep(pp + mv(Rp, value[ValueRow.POINT : ValueRow.SLIDE] + value[ValueRow.SLIDE : ValueRow.AXIS] * q))
+    axis = value[ValueRow.AXIS : ValueRow.MASS]
     a = keep(mv(R, axis[:3]))
-    return R, p, cat([a, mv(R, axis[3:]) + cross(p, a)])
-
-
-def poses_from(walk: Walk, B: tuple, dtype):
-    """Storage of rotations and positions; those of the base and of the dummy are the identity."""
-    return walk.zeros(9, B, dtype).at[walk.slots :].set(eye(dtype, *B).reshape(9, *B)), walk.zeros(3, B, dtype)
+    return R, p, keep(cat([a, mv(R, axis[3:]) + cross(p, a)]))
 
 
 def eye(dtype, *batch):
@@ -208,35 +217,43 @@ def placed(walk: Walk, joints: Joints, B: tuple, each=None, more=()):
     Args:
         walk, joints: Order and joints.
         B: Batch size.
-        each, more: `each(t, R, p) -> values` to be kept beside them, in the storages `more`.
+        each, more: `each(t, parents, R, p, S, more) -> values` to be kept beside them, in the storages `more`.
     """
     W, dtype = walk.width, joints.value.dtype
 
     def outward(t, parents, stored):
-        Rs, ps, *_ = stored
+        Rs, ps, _, *more = stored
         Rp, pp = keep(take(Rs, parents)).reshape(3, 3, W, *B), take(ps, parents)
         R, p, S = place(joints, t, Rp, pp)
-        values = (R.reshape(9, W, *B), p, S, *(each(t, R, p) if each else ()))
+        values = (R.reshape(9, W, *B), p, S, *(each(t, parents, R, p, S, more) if each else ()))
         return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
 
-    return walk.outward(outward, (*poses_from(walk, B, dtype), walk.zeros(6, B, dtype), *more))
+    one = eye(dtype, *B).reshape(9, *B)
+    start = walk.empty(9, B, dtype, one, one), walk.empty(3, B, dtype), walk.empty(6, B, dtype)
+    return walk.outward(outward, (*start, *more))
 
 
 def bodies_of(walk: Walk, joints: Joints, base_value, B: tuple):
     """Rotations and positions of all slots, and their axes and inertias."""
     W, dtype = walk.width, joints.value.dtype
 
-    def inertia(t, R, p):
+    def inertia(t, parents, R, p, S, more):
         _, h, Io = rigid_inertia(R, p, *body_of(at(joints.value, t)))
         return Io.reshape(9, W, *B), h
 
-    R, p, S, Io, h = placed(walk, joints, B, inertia, (walk.zeros(9, B, dtype), walk.zeros(3, B, dtype)))
-    m0, h0, Io0 = base_inertia(base_value)
+    _, h0, Io0 = base_inertia(base_value)
+    more = walk.empty(9, B, dtype, Io0.reshape(9, *h0.shape[1:])), walk.empty(3, B, dtype, h0)
+    R, p, S, Io, h = placed(walk, joints, B, inertia, more)
+    return R, p, Bodies(S, Io, h, masses(walk, joints, base_value))
+
+
+def masses(walk: Walk, joints: Joints, base_value):
+    """Masses of the slots [slots + 2, 1, B]."""
     m = joints.value[:, ValueRow.MASS].reshape(walk.slots, 1, *joints.value.shape[3:])
-    m = walk.zeros(1, m.shape[2:], dtype).at[: walk.slots].set(m)
-    base = Io0.reshape(9, *Io0.shape[3:]), h0[:, 0], m0
-    Io, h, m = (x.at[walk.slots].set(y) for x, y in zip((Io, h, m), base, strict=True))
-    return R, p, Bodies(S, Io, h, m)
+    m0 = base_value[BaseRow.MASS]
+    B = batch_of(m, m0, axes=m0.ndim)
+    wide = lambda x: jnp.broadcast_to(x, (len(x), 1, *B))
+    return cat([wide(m), wide(m0[None, None]), jnp.zeros((1, 1, *B), m.dtype)])
 
 
 def inertia_at(bodies: Bodies, t, W: int):
@@ -258,13 +275,21 @@ def body_of(value):
 
 
 def base_inertia(base_value):
-    """(m, h, Io) of the base about its own origin, with a step's W = 1."""
-    m, c = base_value[BaseRow.MASS][None], base_value[BaseRow.COM : BaseRow.INERTIA, None]
-    I = base_value[BaseRow.INERTIA : BaseRow.FREE].reshape(3, 3, 1, *base_value.shape[1:])
-    return rigid_inertia(eye(m.dtype, 1, *(1,) * (base_value.ndim - 1)), jnp.zeros_like(c), m, c, I)
+    """(m, h, Io) of the base about its own origin."""
+    m, c = base_value[BaseRow.MASS], base_value[BaseRow.COM : BaseRow.INERTIA]
+    I = base_value[BaseRow.INERTIA : BaseRow.FREE].reshape(3, 3, *m.shape)
+    return rigid_inertia(eye(m.dtype, *(1,) * m.ndim), jnp.zeros_like(c), m, c, I)
 
 
 # ---- their motion ----------------------------------------------------------------------------------------------------
+
+
+def advanced(V, A, S, qd, qdd=None):
+    """Twist and acceleration of the bodies of a step from those of their parents."""
+    Sqd = keep(S * qd)
+    V = keep(V + Sqd)
+    A = A + keep(motion_cross(V, Sqd))
+    return V, keep(A if qdd is None else A + S * qdd)
 
 
 def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=()):
@@ -273,20 +298,17 @@ def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=()):
     Args:
         walk, S: Order and axes.
         V0, A0: Of the base [6, B].
-        qd, qdd: By step [T, W, B]; without `qdd`, at zero accelerations.
+        qd, qdd: Of the degrees of freedom [nv, B].
         B: Batch size.
         each, more: `each(t, V, A) -> values` to be kept beside them, in the storages `more`.
     """
     W = walk.width
 
     def outward(t, parents, stored):
-        s = block(S, t, W)
-        Sqd = keep(s * at(qd, t))
-        V = keep(take(stored[0], parents) + Sqd)
-        A = take(stored[1], parents) + keep(motion_cross(V, Sqd))
-        A = keep(A if qdd is None else A + s * at(qdd, t))
+        Vp, Ap = (take(x, parents) for x in stored[:2])
+        V, A = advanced(Vp, Ap, block(S, t, W), walk.of_step(qd, t), walk.of_step(qdd, t))
         values = (V, A, *(each(t, V, A) if each else ()))
         return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
 
-    start = (walk.zeros(6, B, S.dtype).at[walk.slots].set(x) for x in (V0, A0))
+    start = (walk.empty(6, B, S.dtype, x) for x in (V0, A0))
     return walk.outward(outward, (*start, *more))
