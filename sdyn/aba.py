@@ -1,4 +1,6 @@
-"""Forward dynamics by the articulated-body algorithm, and M⁻¹ b by the same sweeps at rest, in the base's frame.
+"""Forward dynamics by the articulated-body algorithm, and M⁻¹ b by the same sweeps at rest.
+
+In the base's frame, or in the links' own: then what goes from a body to another is transformed on the way.
 
 Outward, the force f of each body at zero accelerations (see `rnea.py`). Inward, with ρ the rotor inertia:
     U = IA S,  D = S · U + ρ,  G = U D⁻¹,  IA' += IA − G Uᵀ         (the factor)
@@ -10,7 +12,7 @@ The accelerations that velocities cause are in f, so that one factor serves many
 Source: Featherstone, Rigid Body Dynamics Algorithms (2008), section 7.3. In Jain's operators IA = P, u = ε, f = z.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,10 +21,10 @@ from jax import lax
 from sdyn.batching import Kernel
 from sdyn.chain import BaseRow, ValueRow
 from sdyn.materialise import keep
-from sdyn.rnea import force, newton_euler
+from sdyn.rnea import force, loaded, newton_euler
 from sdyn.rnea_derivatives import slope
 from sdyn.rnea_motion import flat
-from sdyn.spatial import blocks_of, blocks_outer, blocks_times, cat, dot, rigid_inertia, solve6
+from sdyn.spatial import blocks_of, blocks_outer, blocks_times, blocks_to_parent, cat, dot, solve6
 from sdyn.sweep import (
     Bodies,
     Joints,
@@ -33,14 +35,17 @@ from sdyn.sweep import (
     base_inertia,
     batch_of,
     block,
-    body_of,
+    down,
     eye,
+    hinge,
+    inertia_of,
     joints_of,
     masses,
     placed,
     put,
     put_step,
     take,
+    up,
     walk_of,
 )
 from sdyn.workspace import Workspace
@@ -61,7 +66,7 @@ class Factor(NamedTuple):
     """Blocks A, H, M of the articulated inertia of the base [21, B]."""
 
 
-def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F, *, work, saving=False):
+def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F, *, work, saving=False, link=False):
     """Accelerations (a0 [6, B], qdd [nv, B]); the operands as of `newton_euler`, and the forces (f0, tau).
 
     With `saving`, also what `mass_solve` and the derivatives can use again: bodies [slots + 2, 19, B], factor
@@ -70,17 +75,19 @@ def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G,
     B = batch_of(slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G, F)
     free, walk, structure = base_value[BaseRow.FREE], walk_of(slot_index, work), (slot_index, slot_value, base_value)
     held = -G * (1 - free) if G.shape[0] else jnp.zeros_like(V0)  # a free base falls with the rest
-    joints = joints_of(walk, slot_index, slot_value, q, quat)
-    S, f, blocks, bodies = _loaded(walk, joints, base_value, V0 * free, qd, held, B, saving)
-    factor = articulated(walk, S, blocks, rotor, free, B)
-    a0, qdd = solve(walk, S, factor, f - F if F.shape[0] else f, f0 * free, tau, free, rotor.shape[0])
+    joints = joints_of(walk, slot_index, slot_value, q, quat, link)
+    hinges, S, f, blocks, bodies = _moving(walk, joints, base_value, V0 * free, qd, held, B, saving)
+    factor = articulated(walk, S, blocks, rotor, free, B, hinges)
+    f = loaded(walk, joints, f, F, B)
+    a0, qdd = solve(walk, S, factor, f, f0 * free, tau, free, rotor.shape[0], hinges)
 
     def improved(x):
         """One step of refinement: x + M⁻¹ (τ − ID(x)), by the same factor."""
         (a0, qdd), own = x, Workspace(work.whole)  # what is in a branch stays there
-        found0, found = newton_euler(*structure, rotor, q, quat, V0, qd, lifted(a0), qdd, G, F, work=own)
+        operands = *structure, rotor, q, quat, V0, qd, lifted(a0), qdd, G, F
+        found0, found = newton_euler(*operands, work=own, link=link)
         left, same = (f0 * free - found0, tau - found), walk._replace(work=own)
-        more = solve(same, S, factor, walk.zeros(6, B, f.dtype), *left, free, len(qdd))
+        more = solve(same, S, factor, walk.zeros(6, B, f.dtype), *left, free, len(qdd), hinges)
         return tuple(y + d for y, d in zip(x, more, strict=True))
 
     lifted = lambda a0: a0 + G * free if G.shape[0] else a0
@@ -91,50 +98,49 @@ def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G,
     return (a0, qdd, flat(bodies), cat(factor[:2], 1), factor.base) if saving else (a0, qdd)
 
 
-def _loaded(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving: bool):
-    """Axes S, forces at zero accelerations and blocks of the inertia of all bodies; these too, if `saving`."""
+def _moving(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving: bool):
+    """Hinges and axes S, forces at zero accelerations and inertia blocks of all bodies; the bodies, if `saving`."""
+    of_pose = lambda R, p: (R, p) if joints.link else None
+
     def values(V, A, m, h, Io):
         own = (Io.reshape(9, *h.shape[1:]), h) if saving else ()
         return (V, A, force((m, h, Io), V, A), *blocks_of(m, h, Io), *own)
 
     def body(t, parents, R, p, S, stored):
-        V, A = (keep(take(x, parents)) for x in stored[:2])
+        V, A = (keep(down(of_pose(R, p), take(x, parents))) for x in stored[:2])
         V, A = advanced(V, A, S, walk.of_step(qd, t))
-        return values(V, A, *keep(rigid_inertia(R, p, *body_of(at(joints.value, t)))))
+        return values(V, A, *keep(inertia_of(joints, t, R, p)))
 
-    of_base = values(V0, A0, *base_inertia(base_value))
-    more = tuple(walk.empty(len(x), B, V0.dtype, x) for x in of_base)
-    _, _, S, V, A, f, *blocks = placed(walk, joints, B, body, more)
+    more = (walk.empty(len(x), B, V0.dtype, x) for x in values(V0, A0, *base_inertia(base_value)))
+    R, p, S, V, A, f, *blocks = placed(walk, joints, B, body, tuple(more))
     walk.work.release(V, A)
     bodies = Bodies(S, *blocks[3:], masses(walk, joints, base_value)) if saving else None
-    return S, f, blocks[:3], bodies
+    return of_pose(R, p), S, f, blocks[:3], bodies
 
 
-def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, saved, factor, base, b0, b, *, work):
+def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, saved, factor, base, b0, b, *, work, link=False):
     """x of M x = b, as (x0 [6, B], x [nv, B]); `saved`, `factor` and `base` are empty, or from the same M."""
-    walk, free, nv = walk_of(slot_index, work), base_value[BaseRow.FREE], rotor.shape[0]
+    walk, free, nv, hinges = walk_of(slot_index, work), base_value[BaseRow.FREE], rotor.shape[0], None
     if saved.shape[0]:
         S, factor = saved[:, :6], Factor(factor[:, :6], factor[:, 6:], base)
     else:
         B = batch_of(slot_value, base_value, rotor, q, quat, axes=2)
-        S, factor = _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B)
+        joints = joints_of(walk, slot_index, slot_value, q, quat, link)
+        hinges, S, factor = _factored(walk, joints, base_value, rotor, B)
     B = batch_of(S, b0, b, axes=2)
-    return solve(walk, S, factor, walk.zeros(6, B, b0.dtype), b0 * free, b, free, nv)
+    return solve(walk, S, factor, walk.zeros(6, B, b0.dtype), b0 * free, b, free, nv, hinges)
 
 
-def _factored(walk, slot_index, slot_value, base_value, rotor, q, quat, B):
-    """Axes S, and the factor."""
-    joints = joints_of(walk, slot_index, slot_value, q, quat)
-
-    def body(t, parents, R, p, S, stored):
-        return blocks_of(*keep(rigid_inertia(R, p, *body_of(at(joints.value, t)))))
-
-    more = tuple(walk.empty(len(x), B, slot_value.dtype, x) for x in blocks_of(*base_inertia(base_value)))
-    _, _, S, *blocks = placed(walk, joints, B, body, more)
-    return S, articulated(walk, S, blocks, rotor, base_value[BaseRow.FREE], B)
+def _factored(walk: Walk, joints: Joints, base_value, rotor, B: tuple):
+    """Hinges, axes S, and the factor."""
+    body = lambda t, parents, R, p, S, stored: blocks_of(*keep(inertia_of(joints, t, R, p)))
+    more = (walk.empty(len(x), B, rotor.dtype, x) for x in blocks_of(*base_inertia(base_value)))
+    R, p, S, *blocks = placed(walk, joints, B, body, tuple(more))
+    hinges = (R, p) if joints.link else None
+    return hinges, S, articulated(walk, S, blocks, rotor, base_value[BaseRow.FREE], B, hinges)
 
 
-def articulated(walk: Walk, S, blocks, rotor, free, B: tuple) -> Factor:
+def articulated(walk: Walk, S, blocks, rotor, free, B: tuple, hinges) -> Factor:
     """The articulated inertias, from those of the bodies, and the factor that they give."""
     W, axes, dtype = walk.width, S, S.dtype
 
@@ -144,7 +150,9 @@ def articulated(walk: Walk, S, blocks, rotor, free, B: tuple) -> Factor:
         U = keep(blocks_times(*IA, S))
         D = keep(1 / (dot(S, U) + walk.of_step(rotor, t)))
         G = keep(U * D)
-        found = (x - y for x, y in zip(IA, blocks_outer(G, U), strict=True))
+        found = [x - y for x, y in zip(IA, blocks_outer(G, U), strict=True)]
+        if hinges is not None:
+            found = blocks_to_parent(*hinge(hinges, t, W), *keep(found))
         added = (add_to(x, parents, y) for x, y in zip(IAs, found, strict=True))
         return *added, put(Gs, t, W, G), put(Ds, t, W, D[None])
 
@@ -153,7 +161,7 @@ def articulated(walk: Walk, S, blocks, rotor, free, B: tuple) -> Factor:
     return Factor(G, D, cat([x[walk.slots] + y for x, y in zip(blocks, massless, strict=True)]))
 
 
-def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int):
+def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int, hinges=None):
     """Accelerations (a0 [6, B], qdd [nv, B]) from the forces f of the bodies, f0 on the base and tau [nv, B]."""
     W, B = walk.width, f.shape[2:]
 
@@ -161,11 +169,11 @@ def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int):
         f, us = stored
         here = keep(block(f, t, W))
         u = keep(walk.of_step(tau, t) - dot(block(S, t, W), here))
-        return add_to(f, parents, here + block(factor.G, t, W) * u), put_step(us, t, u)
+        return add_to(f, parents, up(hinge(hinges, t, W), here + block(factor.G, t, W) * u)), put_step(us, t, u)
 
     def outward(t, parents, stored):
         a, x = stored
-        before = keep(take(a, parents))
+        before = keep(down(hinge(hinges, t, W), take(a, parents)))
         qdd = keep(at(u, t) * block(factor.Dinv, t, W)[0] - dot(block(factor.G, t, W), before))
         return put(a, t, W, before + block(S, t, W) * qdd), walk.put_dof(x, t, qdd)
 
@@ -185,39 +193,59 @@ def _difference(b, slope, like):
     return b if slope is None else tuple(x - y for x, y in zip(b, slope, strict=True))
 
 
-def _aba_rule(primals, tangents):
-    """dv̇ = M⁻¹ (dτ − dID(q, v, v̇))."""
-    a0, qdd, *left = out = aba_saving(*primals)
+def _aba_rule(primals, tangents, link=False):
+    """dv̇ = M⁻¹ (dτ − dID(q, v, v̇)); in the links' frames, starting afresh."""
+    out = aba_saving(*primals) if not link else (*aba(*primals, link=True), *nothing_saved(primals[1].dtype))
+    a0, qdd, *left = out
     operands, along = list(primals), list(tangents)
     operands[8:10], along[8:10] = (a0, qdd), (None, None)
     b = _difference(tangents[8:10], slope(operands, left[0], along), primals[8:10])
-    return out, [*mass_solve(*primals[:6], *left, *b), *(jnp.zeros_like(x) for x in left)]
+    return out, [*mass_solve(*primals[:6], *left, *b, link=link), *(jnp.zeros_like(x) for x in left)]
 
 
-def _mass_solve_rule(primals, tangents):
-    """dx = M⁻¹ (db − dM x)."""
-    structure, left = primals[:6], primals[6:9]
-    out = mass_solve(*primals)
-    rest, none = [jnp.zeros_like(x) for x in out], jnp.zeros((0, 1), out[0].dtype)
-    operands = [*structure, *rest, *out, none, none[..., None]]
-    b = _difference(tangents[9:], slope(operands, left[0], [*tangents[:6], *[None] * 6]), primals[9:])
-    return out, mass_solve(*structure, *left, *b)
-
-
-def _mass_solve_transpose(operands, cotangents):
-    """M is symmetric: the cotangent of b is M⁻¹ of that of x."""
-    found = mass_solve(*operands[:9], *cotangents)
-    return [x for x, b in zip(found, operands[9:], strict=True) if b is None]
-
-
-def _first_two(primals, tangents):
-    out, slopes = _aba_rule(primals, tangents)
+def _first_two(primals, tangents, link):
+    out, slopes = _aba_rule(primals, tangents, link)
     return out[:2], slopes[:2]
 
 
-aba = Kernel(_aba, rule=_first_two)
+def _mass_solve_rule(primals, tangents, link):
+    """dx = M⁻¹ (db − dM x)."""
+    structure, left = primals[:6], primals[6:9]
+    out = mass_solve(*primals, link=link)
+    rest, none = [jnp.zeros_like(x) for x in out], jnp.zeros((0, 1), out[0].dtype)
+    operands = [*structure, *rest, *out, none, none[..., None]]
+    b = _difference(tangents[9:], slope(operands, left[0], [*tangents[:6], *[None] * 6]), primals[9:])
+    return out, mass_solve(*structure, *left, *b, link=link)
+
+
+def _mass_solve_transpose(operands, cotangents, link):
+    """M is symmetric: the cotangent of b is M⁻¹ of that of x."""
+    found = mass_solve(*operands[:9], *cotangents, link=link)
+    return [x for x, b in zip(found, operands[9:], strict=True) if b is None]
+
+
+@cache
+def _aba_kernel(link: bool) -> Kernel:
+    return Kernel(partial(_aba, link=link), rule=partial(_first_two, link=link))
+
+
+@cache
+def _mass_kernel(link: bool) -> Kernel:
+    rule, transpose = partial(_mass_solve_rule, link=link), partial(_mass_solve_transpose, link=link)
+    return Kernel(partial(_mass_solve, link=link), rule=rule, linear=(9, 10), transpose=transpose, grouped=True)
+
+
+def aba(*operands, link=False):
+    """Accelerations (a0 [6, B], qdd [nv, B]), see `_aba`."""
+    return _aba_kernel(link)(*operands)
+
+
+def mass_solve(*operands, link=False):
+    """x of M x = b, see `_mass_solve`; what is saved is of the common frame."""
+    return _mass_kernel(link)(*operands)
+
+
 aba_saving = Kernel(partial(_aba, saving=True), rule=_aba_rule)
-mass_solve = Kernel(_mass_solve, rule=_mass_solve_rule, linear=(9, 10), transpose=_mass_solve_transpose, grouped=True)
 
 
 def nothing_saved(dtype):

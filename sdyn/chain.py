@@ -87,6 +87,8 @@ class Capacity:
     loops: int
     rows: int
     """Rows of the closures: entries of lam."""
+    frame: str
+    """"common" or "link": the frame that the dynamics are computed in."""
     layout: str
     """"free" or "grounded": exact arrays of one structure; "padded": a base block always, zeros at the end."""
     link_names: tuple[str, ...] = field(compare=False)

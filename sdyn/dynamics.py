@@ -4,6 +4,7 @@ Every function is unbatched, differentiable forward and reverse in every float a
 and `vmap` of it runs the batch-last kernel. A structure of the same capacity is the same compiled program.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -42,7 +43,7 @@ def tree_dynamics(
     pose, structure, G, F = operands_of(chain, q, gravity, f_ext)
     V0, qd = rates_of(chain, pose, v)
     f0, force = rates_of(chain, pose, tau)
-    a0, qdd = _aba.aba(*structure, V0, qd, f0, force - passive_force(chain, pose, qd), G, F)
+    a0, qdd = _aba.aba(*structure, V0, qd, f0, force - passive_force(chain, pose, qd), G, F, link=_by_link(chain))
     return join(chain, pose, a0, qdd + spin(chain, qd))
 
 
@@ -74,7 +75,7 @@ def inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, on_slots=None):
         F = on_slots[..., None] if f_ext is None else F + on_slots[..., None]
     V0, qd = rates_of(chain, pose, v)
     a0, qdd = rates_of(chain, pose, vdot)
-    f0, tau = rnea(*structure, V0, qd, a0, qdd - spin(chain, qd), G, F)
+    f0, tau = rnea(*structure, V0, qd, a0, qdd - spin(chain, qd), G, F, link=_by_link(chain))
     return join(chain, pose, f0, tau + passive_force(chain, pose, qd))
 
 
@@ -93,6 +94,10 @@ def mass_matrix(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
         Featherstone (2008), section 6.2.
     """
     (q,) = expect(chain, q=q)
+    if _by_link(chain):  # in its columns, the forces of unit accelerations
+        zero = jnp.zeros(chain.nv, q.dtype)
+        still = inverse_dynamics(chain, q, zero, zero)  # of the springs
+        return jax.vmap(lambda e: inverse_dynamics(chain, q, zero, e) - still)(jnp.eye(chain.nv, dtype=q.dtype))
     pose, (index, *rest), _, _ = operands_of(chain, q, None, None)
     (M,) = crba(index, chain.ancestors, *rest)
     M, nb = M[..., 0], chain.capacity.base_nv
@@ -118,7 +123,11 @@ def solve_mass(chain: Chain, q: Float[Array, " nq"], b: Float[Array, " nv"]) -> 
         return rebase.rates_back(chain, inner, pose, solve_mass(inner, q, rebase.force_seen(chain, inner, pose, b)))
     pose, structure, _, _ = operands_of(chain, q, None, None)
     left = _aba.nothing_saved(chain.dtype)
-    return join(chain, pose, *_aba.mass_solve(*structure, *left, *rates_of(chain, pose, b)))
+    return join(chain, pose, *_aba.mass_solve(*structure, *left, *rates_of(chain, pose, b), link=_by_link(chain)))
+
+
+def _by_link(chain: Chain) -> bool:
+    return chain.capacity.frame == "link"
 
 
 def operands_of(chain, q, gravity, f_ext):

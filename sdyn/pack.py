@@ -17,9 +17,13 @@ from sdyn.schedule import schedule
 
 MEMORY = 2e9
 """Bytes that packing may take; they grow with the square of the bodies. A chain of 10 000 joints takes half of them."""
+FRAMES = ("common", "link")
+"""Where dynamics are computed."""
 
 
-def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = None, dtype=None) -> Chain:
+def pack(
+    robot: Robot, capacity: Capacity | None = None, *, width: int | None = None, frame: str = "common", dtype=None
+) -> Chain:
     """Pack a robot into arrays.
 
     Args:
@@ -27,6 +31,9 @@ def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = 
         capacity: Sizes to pad to, from `capacity([...])`; exact sizes if left out.
         width: Bodies in a step of the schedule, for exact sizes: 1 (default) is best for batches; about the number
             of arms is best for one sample at a time.
+        frame: Where dynamics are computed, for exact sizes: in the base's "common" frame, or in each "link"'s, which
+            is slower and loses fewer digits to cancellation far from the base (a chain of 1000 joints); the
+            derivatives and the closures are computed in the common one.
         dtype: float32 or float64; by default float64 where JAX has it switched on.
 
     Returns:
@@ -35,16 +42,17 @@ def pack(robot: Robot, capacity: Capacity | None = None, *, width: int | None = 
     Raises:
         RobotError: If nothing resists the motion of a joint or of a free base, or the capacity is too small.
     """
-    capacity = _capacity_of([robot], width or 1, padded=False) if capacity is None else capacity
+    capacity = _capacity_of([robot], width or 1, frame, padded=False) if capacity is None else capacity
     return jax.device_put(_arrays(robot, capacity, _float_type(dtype)))
 
 
-def capacity(robots, *, width: int = 1, memory: float = MEMORY) -> Capacity:
+def capacity(robots, *, width: int = 1, frame: str = "common", memory: float = MEMORY) -> Capacity:
     """Sizes that hold any of the robots.
 
     Args:
         robots: The variants, at least one.
         width: Bodies in a step of the schedule.
+        frame: Where dynamics are computed, see `pack`.
         memory: What packing one of them may take [bytes].
 
     Raises:
@@ -53,7 +61,7 @@ def capacity(robots, *, width: int = 1, memory: float = MEMORY) -> Capacity:
     robots = list(robots)
     if not robots:
         raise RobotError("capacity: the list of robots is empty.")
-    return _capacity_of(robots, width, padded=True, memory=memory)
+    return _capacity_of(robots, width, frame, padded=True, memory=memory)
 
 
 def family(robots, *, width: int = 1, dtype=None) -> Chain:
@@ -114,7 +122,11 @@ def _float_type(dtype):
 # ---- sizes -----------------------------------------------------------------------------------------------------------
 
 
-def _capacity_of(robots, width, padded, memory=MEMORY) -> Capacity:
+def _capacity_of(robots, width, frame, padded, memory=MEMORY) -> Capacity:
+    if frame not in FRAMES:
+        raise RobotError(
+            f'pack: the frame is {frame!r}; it is "common" or "link".'
+        )
     if width < 1:
         raise RobotError(f"the width is {width}; a step holds at least one body.")
     bodies = max(sum(joint.dof for joint in robot.moving) for robot in robots)
@@ -131,8 +143,8 @@ def _capacity_of(robots, width, padded, memory=MEMORY) -> Capacity:
     steps, nq, nv, quaternions, rows = (max(column) for column in zip(*sizes, strict=True))
     layout = "padded" if padded else "grounded" if robots[0].grounded else "free"
     return Capacity(
-        max(steps, 1), width, len(links), len(joints), len(frames), nq, nv, quaternions, len(loops), rows, layout,
-        links, joints, frames, loops, bool(others),
+        max(steps, 1), width, len(links), len(joints), len(frames), nq, nv, quaternions, len(loops), rows,
+        frame, layout, links, joints, frames, loops, bool(others),
     )  # fmt: skip
 
 

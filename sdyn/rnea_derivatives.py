@@ -1,6 +1,6 @@
 """Inverse dynamics and its derivatives as kernels: the tangent and the adjoint are the transposes of each other."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -73,9 +73,16 @@ def slope(primals, saved, tangents):
     return kernel(*primals, saved, *(tangents[i] for i in given))
 
 
-def _rnea_rule(primals, tangents):
-    out, none = rnea(*primals), jnp.zeros((0, 1, 1), primals[1].dtype)
+def _rnea_rule(primals, tangents, link):
+    out, none = rnea(*primals, link=link), jnp.zeros((0, 1, 1), primals[1].dtype)
     return out, slope(primals, none, tangents) or [jnp.zeros_like(y) for y in out]
 
 
-rnea = Kernel(newton_euler, rule=_rnea_rule)
+@cache
+def _rnea_kernel(link: bool) -> Kernel:
+    return Kernel(partial(newton_euler, link=link), rule=partial(_rnea_rule, link=link))
+
+
+def rnea(*operands, link=False):
+    """Forces (f0 [6, B], tau [nv, B]), see `newton_euler`."""
+    return _rnea_kernel(link)(*operands)

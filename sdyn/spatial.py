@@ -103,6 +103,30 @@ def blocks_outer(a, b):
     return packed(a[:3], b[:3]), H.reshape(9, *a.shape[1:]), packed(a[3:], b[3:])
 
 
+def to_child(R, p, V):
+    """A motion vector in the frame of a child, which stands at (R, p) in the vector's own."""
+    w, v = V[:3], V[3:]
+    return cat([mtv(R, w), mtv(R, keep(v + cross(w, p)))])
+
+
+def to_parent(R, p, f):
+    """A force vector of that child in the frame of its parent."""
+    linear = keep(mv(R, f[3:]))
+    return cat([mv(R, f[:3]) + cross(p, linear), linear])
+
+
+def blocks_to_parent(R, p, A, H, M):
+    """An inertia of that child in the frame of its parent: turned, then about the parent's origin."""
+    square = lambda X: jnp.stack([jnp.stack([X[k] for k in row]) for row in PACKED])
+    turned = lambda X: keep(mm(keep(mm(R, X)), transposed(R)))
+    packed = lambda X: cat([X[0], X[1, 1:], X[2, 2:]])
+    A, H, M = (turned(X) for X in (square(A), H.reshape(3, 3, *H.shape[1:]), square(M)))
+    P = hat(p)
+    moved = keep(H + mm(P, M))
+    A = A - mm(moved, P) + mm(P, transposed(H))
+    return packed(A), moved.reshape(9, *moved.shape[2:]), packed(M)
+
+
 def solve6(A, H, M, b):
     """x of [[A, H], [Hᵀ, M]] x = b, positive definite, by an unrolled L D Lᵀ."""
 

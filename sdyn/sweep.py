@@ -1,7 +1,8 @@
 """What the sweeps over a chain share: the order of the bodies, storage by slot, and the bodies in the base's frame.
 
 All quantities are in the base's own frame (the ground's, seen from the base, when it is grounded): inertias add up
-without transforms and nothing depends on the pose of the base. Arrays are `(components, W, *B)` inside a step and
+without transforms and nothing depends on the pose of the base. The values, not the derivatives, of dynamics exist in
+the links' own frames too: slower, and more exact far from the base. Arrays are `(components, W, *B)` inside a step and
 `(slots + 2, components, *B)` between steps; the last two slots are the base and a dummy. B is the batch: one axis, or
 two where many columns share a sample.
 
@@ -19,7 +20,7 @@ from jax import lax
 from sdyn.chain import BaseRow, SlotRow, ValueRow
 from sdyn.materialise import keep
 from sdyn.rotation import matrix
-from sdyn.spatial import cat, cross, mm, motion_cross, mv, rigid_inertia
+from sdyn.spatial import cat, cross, mm, motion_cross, mv, rigid_inertia, to_child, to_parent
 from sdyn.trigonometry import sin_cos
 from sdyn.workspace import Workspace
 
@@ -129,7 +130,7 @@ def block(stored, t, W: int):
 
 def put(stored, t, W: int, x):
     """Store the value of the bodies of step t."""
-    x = jnp.moveaxis(x, 1, 0)
+    x = jnp.moveaxis(jnp.broadcast_to(x, (stored.shape[1], W, *stored.shape[2:])), 1, 0)
     return lax.dynamic_update_slice(stored, x, _corner(stored, t * W), allow_negative_indices=False)
 
 
@@ -163,6 +164,8 @@ class Joints(NamedTuple):
     """Coordinates of the degrees of freedom [nv, B]."""
     quat: jnp.ndarray | None
     """Rotation of the spherical joint that starts in a slot, identity elsewhere [T, 3, 3, W, B]."""
+    link: bool = False
+    """Whether each body is in its own frame, instead of all in the base's."""
 
     def turned(self, t):
         """The coordinates q of step t [W, B], the rotations that they cause [3, 3, W, B], sin q and cos q."""
@@ -184,26 +187,37 @@ class Bodies(NamedTuple):
     """Rotational inertia [slots + 2, 9, B], first moment [slots + 2, 3, B] and mass [slots + 2, 1, B]."""
 
 
-def joints_of(walk: Walk, slot_index, slot_value, q, quat) -> Joints:
+def joints_of(walk: Walk, slot_index, slot_value, q, quat, link: bool = False) -> Joints:
     """The joints, of constants and coordinates."""
     R = None
     if quat.shape[0]:
         one = eye(quat.dtype, 1, *quat.shape[2:])
         rotations = cat([matrix(jnp.swapaxes(quat, 0, 1)), one], 2)
         R = keep(jnp.moveaxis(jnp.take(rotations, slot_index[SlotRow.QUAT], axis=2), 2, 0))
-    return Joints(walk, slot_value, q, R)
+    return Joints(walk, slot_value, q, R, link)
 
 
 def place(joints: Joints, t, Rp, pp):
-    """Rotation, position and motion subspace S of the bodies of step t, from their parents' R [3, 3, W, B] and p."""
+    """Rotation, position and motion subspace S of the bodies of step t, from their parents' R [3, 3, W, B] and p.
+
+    Where each body is in its own frame, its pose is that in its parent's, and S is constant.
+    """
     value, (q, turn, *_) = at(joints.value, t), joints.turned(t)
-    R = keep(mm(Rp, turn))
+    offset = value[ValueRow.POINT : ValueRow.SLIDE] + value[ValueRow.SLIDE : ValueRow.AXIS] * q
+    axis = value[ValueRow.AXIS : ValueRow.MASS]
+    R, p = (turn, offset) if joints.link else (keep(mm(Rp, turn)), keep(pp + mv(Rp, offset)))
     if joints.quat is not None:
         R = keep(mm(R, at(joints.quat, t)))
-    p = keep(pp + mv(Rp, value[ValueRow.POINT : ValueRow.SLIDE] + value[ValueRow.SLIDE : ValueRow.AXIS] * q))
-    axis = value[ValueRow.AXIS : ValueRow.MASS]
+    if joints.link:
+        return R, p, axis
     a = keep(mv(R, axis[:3]))
     return R, p, keep(cat([a, mv(R, axis[3:]) + cross(p, a)]))
+
+
+def inertia_of(joints: Joints, t, R, p):
+    """(m, h, Io) of the bodies of step t at (R, p), or each in its own frame."""
+    m, c, I = body_of(at(joints.value, t))
+    return rigid_inertia(*((eye(c.dtype, *(1,) * (c.ndim - 1)), 0 * c) if joints.link else (R, p)), m, c, I)
 
 
 def eye(dtype, *batch):
@@ -223,9 +237,9 @@ def placed(walk: Walk, joints: Joints, B: tuple, each=None, more=()):
 
     def outward(t, parents, stored):
         Rs, ps, _, *more = stored
-        Rp, pp = keep(take(Rs, parents)).reshape(3, 3, W, *B), take(ps, parents)
+        Rp, pp = (keep(take(Rs, parents)).reshape(3, 3, W, *B), take(ps, parents)) if not joints.link else (None, None)
         R, p, S = place(joints, t, Rp, pp)
-        values = (R.reshape(9, W, *B), p, S, *(each(t, parents, R, p, S, more) if each else ()))
+        values = (R.reshape(9, *R.shape[2:]), p, S, *(each(t, parents, R, p, S, more) if each else ()))
         return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
 
     one = eye(dtype, *B).reshape(9, *B)
@@ -235,11 +249,11 @@ def placed(walk: Walk, joints: Joints, B: tuple, each=None, more=()):
 
 def bodies_of(walk: Walk, joints: Joints, base_value, B: tuple):
     """Rotations and positions of all slots, and their axes and inertias."""
-    W, dtype = walk.width, joints.value.dtype
+    dtype = joints.value.dtype
 
     def inertia(t, parents, R, p, S, more):
-        _, h, Io = rigid_inertia(R, p, *body_of(at(joints.value, t)))
-        return Io.reshape(9, W, *B), h
+        _, h, Io = inertia_of(joints, t, R, p)
+        return Io.reshape(9, *h.shape[1:]), h
 
     _, h0, Io0 = base_inertia(base_value)
     more = walk.empty(9, B, dtype, Io0.reshape(9, *h0.shape[1:])), walk.empty(3, B, dtype, h0)
@@ -292,7 +306,25 @@ def advanced(V, A, S, qd, qdd=None):
     return V, keep(A if qdd is None else A + S * qdd)
 
 
-def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=()):
+def hinge(hinges, t, W: int):
+    """Rotation [3, 3, W, B] and position of the bodies of step t in their parents, or None in the common frame."""
+    if hinges is None:
+        return None
+    R, p = (block(x, t, W) for x in hinges)
+    return R.reshape(3, 3, *p.shape[1:]), p
+
+
+def down(hinge, V):
+    """Motion vectors of parents, in the frames of their children."""
+    return V if hinge is None else keep(to_child(*hinge, V))
+
+
+def up(hinge, f):
+    """Force vectors of children, in the frames of their parents."""
+    return f if hinge is None else keep(to_parent(*hinge, f))
+
+
+def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=(), hinges=None):
     """Twists V = V' + S q̇ and spatial accelerations A = A' + S q̈ + V x S q̇ of all slots [slots + 2, 6, B].
 
     Args:
@@ -301,11 +333,12 @@ def moved(walk: Walk, S, V0, qd, A0, qdd, B: tuple, each=None, more=()):
         qd, qdd: Of the degrees of freedom [nv, B].
         B: Batch size.
         each, more: `each(t, V, A) -> values` to be kept beside them, in the storages `more`.
+        hinges: Poses in the parents, where each body is in its own frame.
     """
     W = walk.width
 
     def outward(t, parents, stored):
-        Vp, Ap = (take(x, parents) for x in stored[:2])
+        Vp, Ap = (down(hinge(hinges, t, W), take(x, parents)) for x in stored[:2])
         V, A = advanced(Vp, Ap, block(S, t, W), walk.of_step(qd, t), walk.of_step(qdd, t))
         values = (V, A, *(each(t, V, A) if each else ()))
         return tuple(put(x, t, W, y) for x, y in zip(stored, values, strict=True))
