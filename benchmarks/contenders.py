@@ -19,9 +19,11 @@ def batched(f):
     return lambda chain, *x: jax.vmap(f, (None, *(0,) * len(x)))(chain, *x)
 
 
-def forward(robot, batch: int, *, dtype="float64", width=None, capacity=None, all_at_once=None) -> Contender:
+def forward(
+    robot, batch: int, *, dtype="float64", width=None, frame="common", capacity=None, all_at_once=None
+) -> Contender:
     """Forward dynamics of `batch` states in a compiled loop; batch 1 is one state, without vmap."""
-    chain = sdyn.pack(robot, capacity, width=width, dtype=dtype)
+    chain = sdyn.pack(robot, capacity, width=width, frame=frame, dtype=dtype)
     q, v, tau = peers.states(robot, batch)
     if capacity is not None:
         (q, v), (_, tau) = sdyn.pad(chain, q, v), sdyn.pad(chain, q, tau)

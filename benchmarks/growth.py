@@ -1,4 +1,4 @@
-"""What forward dynamics costs as the work grows: joints, batch, depth and width, padding, blocks; and the memory.
+"""What forward dynamics costs as the work grows: joints, batch, depth and width, padding, blocks, frames; the memory.
 
     python benchmarks/growth.py
 
@@ -75,7 +75,7 @@ def by_shape():
     }
 
 
-def by_padding(batch=256):
+def by_padding():
     """The 37-DOF robot and its 9-DOF form, in exact sizes and in the capacity of both."""
     import contenders
     import subjects
@@ -84,14 +84,44 @@ def by_padding(batch=256):
 
     full, reduced, _ = subjects.compared().values()
     size = sdyn.capacity([full, reduced])
-    return measured(
-        {
-            "37 DOF, exact": contenders.forward(full, batch),
-            "37 DOF, in the capacity": contenders.forward(full, batch, capacity=size),
-            "9 DOF, exact": contenders.forward(reduced, batch),
-            "9 DOF, in the capacity": contenders.forward(reduced, batch, capacity=size),
-        }
-    )
+    return {
+        f"batch {batch}": measured(
+            {
+                "37 DOF, exact": contenders.forward(full, batch),
+                "37 DOF, in the capacity": contenders.forward(full, batch, capacity=size),
+                "9 DOF, exact": contenders.forward(reduced, batch),
+                "9 DOF, in the capacity": contenders.forward(reduced, batch, capacity=size),
+            }
+        )
+        for batch in (1, 256, 2048)
+    }
+
+
+def by_frame(batch=64):
+    """Common frame and links' frames, float64 and float32: time, and error against the links' frames in float64."""
+    import contenders
+    import jax
+    import numpy as np
+    import peers
+    import subjects
+
+    import sdyn
+
+    def accelerations(robot, frame, dtype):
+        chain, x = sdyn.pack(robot, frame=frame, dtype=dtype), (y.astype(dtype) for y in peers.states(robot, batch))
+        return np.asarray(jax.jit(contenders.batched(sdyn.forward_dynamics))(chain, *x), float)
+
+    out = {}
+    for name, robot in {"37 DOF": subjects.compared()["paper37"]} | {
+        f"chain of {n}": subjects.chain(n) for n in (31, 316)
+    }.items():
+        how = [(frame, dtype) for dtype in ("float64", "float32") for frame in ("link", "common")]
+        run = {" ".join(x): contenders.forward(robot, batch, frame=x[0], dtype=x[1]) for x in how}
+        out[name], exact = measured(run), accelerations(robot, "link", "float64")
+        for x in how:
+            error = np.abs(accelerations(robot, *x) - exact).max() / np.abs(exact).max()
+            out[name][" ".join(x)]["error"] = float(error)
+    return out
 
 
 def by_block(batch=4096):
@@ -148,8 +178,14 @@ def long_chain(few=100, many=1000, batch=16) -> dict:
 
 def show(result):
     """Print the medians."""
-    for key in ("joints", "batch", "padding", "block"):
+    for key in ("joints", "batch", "block"):
         print(f"by {key} [us a sample]:", ", ".join(f"{n}: {x['median_us']:.2f}" for n, x in result[key].items()))
+    for batch, times in result["padding"].items():
+        print(f"{batch}, by padding:", ", ".join(f"{n}: {x['median_us']:.2f}" for n, x in times.items()))
+    for name, times in result["frame"].items():
+        print(
+            f"{name}, by frame:", ", ".join(f"{n}: {x['median_us']:.2f} ({x['error']:.0e})" for n, x in times.items())
+        )
     for batch, shapes in result["shape"].items():
         for name, widths in shapes.items():
             print(f"{batch}, {name}, by width:", ", ".join(f"{w}: {x['median_us']:.2f}" for w, x in widths.items()))
@@ -190,7 +226,7 @@ def main():
     """Measure, save, show."""
     harness.one_thread()
     result = dict(what="time per sample of forward dynamics, one thread on one core", **harness.machine())
-    for f in (by_joints, by_batch, by_shape, by_padding, by_block):
+    for f in (by_joints, by_batch, by_shape, by_padding, by_block, by_frame):
         key = f.__name__.removeprefix("by_")
         print(f"by {key}", flush=True)
         result[key] = f()

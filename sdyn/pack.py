@@ -124,9 +124,7 @@ def _float_type(dtype):
 
 def _capacity_of(robots, width, frame, padded, memory=MEMORY) -> Capacity:
     if frame not in FRAMES:
-        raise RobotError(
-            f'pack: the frame is {frame!r}; it is "common" or "link".'
-        )
+        raise RobotError(f'pack: the frame is {frame!r}; it is "common" or "link".')
     if width < 1:
         raise RobotError(f"the width is {width}; a step holds at least one body.")
     bodies = max(sum(joint.dof for joint in robot.moving) for robot in robots)
