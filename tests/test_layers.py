@@ -21,7 +21,7 @@ HOST = [
     ["models"],
 ]
 DEVICE = [
-    ["chain", "materialise", "batching", "semidefinite"],
+    ["chain", "materialise", "workspace", "batching", "semidefinite"],
     ["merge", "spatial", "rotation", "trigonometry"],
     ["pack", "sweep", "inputs", "coordinates"],
     ["rnea", "rnea_motion", "rnea_tangent", "rnea_adjoint", "rnea_derivatives", "rnea_jacobian", "crba", "aba"],
