@@ -51,6 +51,10 @@ class Certificate:
         """Whether every check passed."""
         return all(row.ok for row in self.rows)
 
+    def worst(self, name: str) -> float:
+        """The largest value of the checks whose names start so; infinite if one is not a number."""
+        return float(np.nan_to_num([row.value for row in self.rows if row.name.startswith(name)], nan=np.inf).max())
+
     @property
     def sentence(self) -> str:
         """The certificate in one line of words."""

@@ -14,7 +14,7 @@ from planners.certify import certify
 from planners.plan import Plan
 from planners.task import Task, TaskError
 
-ACCURACIES = {"draft": 0.5, "standard": 1.0, "fine": 2.0}  # multiples of the task's intervals
+ACCURACIES = {"fast": 0.5, "balanced": 1.0, "accurate": 2.0, "reference": 4.0}  # multiples of the task's intervals
 FINE = 12  # the output's grid, relative to the solver's; a multiple of 4 for the certificate
 ITERATIONS = 150
 
@@ -29,7 +29,9 @@ def plan(
         solver: "sqp".
         seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
             result that is certified is kept.
-        accuracy: "draft" (half of the task's intervals), "standard" or "fine" (twice); standard if left out.
+        accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
+            balanced if left out. Or a wanted error such as "1e-6": the first of these whose motion, integrated again by
+            other code, is that close to the plan [m, rad, m/s, rad/s].
         progress: Whether to show a live table.
 
     Returns:
@@ -38,7 +40,19 @@ def plan(
     Raises:
         TaskError: If an argument is none of these, or float64 is off.
     """
-    fine = _checked(solver, seeds, accuracy)
+    names, wanted = _checked(solver, seeds, accuracy)
+    for name in names:
+        found = _planned(task, seeds, name, progress)
+        error = found.certificate.worst("integrated again") if found.certificate else np.inf
+        if error <= wanted or found.status == "infeasible":
+            return found
+    said = f"The motion integrated again differs by {error:.1e}, and {wanted:g} was wanted."
+    return replace(found, status="not converged", verdict=f"{found.verdict} {said}")
+
+
+def _planned(task, seeds, accuracy, progress) -> Plan:
+    """The plan on one grid."""
+    fine = ACCURACIES[accuracy]
     from threadpoolctl import threadpool_limits  # importing it sets an environment variable
 
     from planners.progress import Live
@@ -60,7 +74,7 @@ def plan(
                 history.append((len(history), float(best.near.cost), float(best.violation)))
                 live.iteration(*history[-1], float(best.step), sqp.running(state))
         live.compiling("the certificate")
-        options = seeds, fine, accuracy or "standard"
+        options = seeds, fine, accuracy
         ends = [sqp.pick(state, k) for k in sqp.ranking(state)]
         found = _best(_result(task, problem, module, end, np.array(history), options) for end in ends)
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
@@ -82,16 +96,24 @@ def _best(results) -> Plan:
     return first
 
 
-def _checked(solver, seeds, accuracy) -> float:
+def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:
+    """Names of the grids to try, and the error that ends it."""
     if solver != "sqp":
         raise TaskError(f"there is no solver {solver!r}; this version has 'sqp'.")
     if not isinstance(seeds, int) or seeds < 1:
         raise TaskError(f"seeds is {seeds!r}; it must be a whole number from 1.")
-    if accuracy is not None and accuracy not in ACCURACIES:
-        raise TaskError(f"accuracy is {accuracy!r}; it must be one of {', '.join(map(repr, ACCURACIES))}.")
     if not jax.config.jax_enable_x64:
         raise TaskError('planning needs float64; call jax.config.update("jax_enable_x64", True) first.')
-    return ACCURACIES[accuracy or "standard"]
+    if accuracy is None or accuracy in ACCURACIES:
+        return (accuracy or "balanced",), np.inf
+    try:
+        wanted = float(accuracy)
+    except (TypeError, ValueError):
+        wanted = np.nan
+    if not 0 < wanted < np.inf:
+        named = ", ".join(map(repr, ACCURACIES))
+        raise TaskError(f"accuracy is {accuracy!r}; it must be one of {named}, or a wanted error such as '1e-6'.")
+    return tuple(ACCURACIES), wanted
 
 
 def _result(task, problem, module, state, history, options):

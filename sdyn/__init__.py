@@ -35,7 +35,9 @@ from sdyn.floating import (
 from sdyn.actuators import frame_wrench, wheels
 from sdyn.params import params, regressor, with_locks, with_params
 from sdyn.transition import transfer
+from sdyn.accuracy import Accuracy, PRESETS
 from sdyn.integrate import integrate
+from sdyn.choose import Choice, choose
 from sdyn.rollout import Phases, hybrid_rollout, rollout
 from sdyn.diagnose import Diagnosis, diagnose, growth
 

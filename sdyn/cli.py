@@ -77,7 +77,7 @@ def plan(
     out: Folder = None,
     solver: Annotated[str, arg(metavar="NAME")] = "sqp",
     seeds: int = 1,
-    accuracy: Literal["draft", "standard", "fine"] = "standard",
+    accuracy: Annotated[str, arg(metavar="fast|balanced|accurate|reference|ERROR")] = "balanced",
 ) -> int:
     """Plan a task, certify the result, and write it with figures and an animation.
 
@@ -86,7 +86,8 @@ def plan(
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
         solver: Which solver; this version has sqp.
         seeds: How many starting points to improve and solve at once; the best certified result is kept.
-        accuracy: How fine the solver's grid is: half of the task's intervals, as many, or twice as many.
+        accuracy: How fine the solver's grid is: fast (half of the task's intervals), balanced, accurate (twice) or
+            reference (four times); or a wanted error such as 1e-6, for the first of these that delivers it.
     """
     planners = _planners()
     wanted = planners.load(task)

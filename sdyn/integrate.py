@@ -11,16 +11,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from sdyn.accuracy import Accuracy
+from sdyn.adaptive import adaptive_step
 from sdyn.chain import Chain
-from sdyn.constraints import forward_dynamics
+from sdyn.constraints import constrained_dynamics, forward_dynamics
 from sdyn.coordinates import increment_rate, retract
 from sdyn.drift import corrected
 from sdyn.inputs import expect
 from sdyn.rosenbrock import rosenbrock_step
 from sdyn.variational import variational_step
-
-METHODS = {"semi_implicit": 1, "rk4": 4, "variational": 2, "implicit": 4}
-"""The orders of the methods: an error of a motion shrinks like dt to this power."""
 
 
 def integrate(
@@ -43,7 +42,8 @@ def integrate(
         tau: Force, laid out as v [N m, N].
         dt: Step [s]; may be traced, zero or negative.
         method: "rk4" (order 4), "semi_implicit" (order 1, one evaluation), "variational" (order 2; keeps momentum to
-            rounding and energy without a trend) or "implicit" (order 4, L-stable, for stiff joints and forces).
+            rounding and energy without a trend), "implicit" (order 4, A-stable, for stiff joints and forces) or
+            "adaptive" (order 8, many steps in one, to a relative and absolute error of 1e-13; needs diffrax).
         drift: How loops stay closed: "project" moves the state back after the step, in the mass metric; a number is a
             Baumgarte rate [1/s] (cheaper, but the error only decays; rate times dt at most 1), 0 does nothing. The
             variational method closes them itself.
@@ -57,18 +57,23 @@ def integrate(
         ValueError: If the method is unknown, or a shape or type differs.
     """
     q, v, tau = expect(chain, q=q, v=v, tau=tau)
-    return step(chain, q, v, lambda t, q, v: tau, 0.0, dt, method=method, drift=drift, gravity=gravity, f_ext=f_ext)
+    dial = Accuracy(method, drift=drift)
+    return step(chain, q, v, lambda t, q, v: tau, 0.0, dt, dial, gravity=gravity, f_ext=f_ext)
 
 
-def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_ext=None):
+def step(chain, q, v, force, t, dt, dial: Accuracy, *, gravity=None, f_ext=None):
     """`integrate`, with the force (and f_ext, if it is callable) as a function of time and state, for every stage."""
-    dt = jnp.asarray(dt, chain.dtype)
-    project = isinstance(drift, str)
-    if project and drift != "project":
-        raise ValueError(f"integrate: drift is {drift!r}; it must be 'project' or a Baumgarte rate [1/s].")
-    options = dict(gravity=gravity) | ({} if project else dict(baumgarte=drift))
+    dt, method = jnp.asarray(dt, chain.dtype), dial.method
+    project = isinstance(dial.drift, str)
+    options = dict(gravity=gravity) | ({} if project else dict(baumgarte=dial.drift))
     wrenches = f_ext if callable(f_ext) else lambda t, q, v: f_ext
-    acceleration = lambda t, q, v: forward_dynamics(chain, q, v, force(t, q, v), f_ext=wrenches(t, q, v), **options)
+
+    def acceleration(t, q, v):
+        x = chain, q, v, force(t, q, v)
+        if dial.loops == "partition" and chain.capacity.rows:
+            return constrained_dynamics(*x, f_ext=wrenches(t, q, v), method="partition", **options)[0]
+        return forward_dynamics(*x, f_ext=wrenches(t, q, v), **options)
+
     if method == "variational":
         guess = v + dt / 2 * acceleration(t, q, v)
         return variational_step(chain, q, v, force, wrenches, gravity, guess, t, dt)
@@ -80,7 +85,7 @@ def step(chain, q, v, force, t, dt, *, method, drift="project", gravity=None, f_
     elif method == "implicit":
         q, v = _implicit(chain, q, v, acceleration, t, dt)
     else:
-        raise ValueError(f"integrate: there is no method {method!r}; the methods are {', '.join(METHODS)}.")
+        q, v = adaptive_step(chain, q, v, acceleration, t, dt, dial.tolerance, dial.derivatives)
     return corrected(chain, q, v) if project and chain.capacity.rows else (q, v)
 
 

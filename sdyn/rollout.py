@@ -13,9 +13,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from sdyn.accuracy import preset, wanted_error
 from sdyn.chain import Chain
+from sdyn.choose import choose
 from sdyn.inputs import expect
-from sdyn.integrate import step
+from sdyn.march import forces, march
 from sdyn.transition import transfer
 
 
@@ -28,6 +30,7 @@ def rollout(
     *,
     method: str = "rk4",
     drift="project",
+    accuracy=None,
     steps: int | None = None,
     gravity: Float[Array, "3"] | None = None,
     f_ext=None,
@@ -40,6 +43,8 @@ def rollout(
         taus: Forces [nt, nv], constant over a step; or a function (t, q, v) -> [nv], evaluated at every stage.
         dt: Step [s].
         method, drift: As for `integrate`.
+        accuracy: In their place, an `Accuracy`, the name of one (fast, balanced, accurate, reference), or a wanted
+            error such as "1e-6", for which `choose` measures; that not under jit.
         steps: Number of steps, static; needed where taus is a function.
         gravity: As for `forward_dynamics`.
         f_ext: Wrenches on the links [n, 6], constant; or a function (t, q, v) -> [n, 6], evaluated at every stage.
@@ -47,10 +52,13 @@ def rollout(
     Returns:
         qs, vs: States at the ends of the steps, the start first.
     """
-    force, steps = _force("rollout", taus, steps, 0)
-    q, v = expect(chain, q=q, v=v)
+    if wanted_error(accuracy):
+        accuracy = choose(chain, q, v, taus, dt, accuracy, steps=steps, gravity=gravity, f_ext=f_ext).accuracy
+    force, steps = forces("rollout", taus, steps, 0)
+    dial = preset(accuracy, method=method, drift=drift)
+    chain, q, v, gravity, f_ext = dial.cast((chain, *expect(chain, q=q, v=v), gravity, f_ext))
     t = jnp.asarray(dt, q.dtype) * jnp.arange(steps + 1)
-    qs, vs = _phase(chain, q, v, force, t, dt, method=method, drift=drift, gravity=gravity, f_ext=f_ext)
+    qs, vs = march(chain, q, v, force, t, dt, dial, gravity=gravity, f_ext=f_ext)
     return jnp.concatenate([q[None], qs]), jnp.concatenate([v[None], vs])
 
 
@@ -78,6 +86,7 @@ def hybrid_rollout(
     *,
     method: str = "rk4",
     drift="project",
+    accuracy=None,
     steps: int | None = None,
     gravity: Float[Array, "3"] | None = None,
     f_ext=None,
@@ -95,17 +104,18 @@ def hybrid_rollout(
         durations: Of the phases [s], not negative; switch times are their running sums.
         members: Number of each phase's structure in the family.
         method, drift: As for `integrate`.
+        accuracy: In their place, an `Accuracy` or the name of one.
         steps: Steps in each phase, static; needed where taus is a function.
         gravity, f_ext: As for `rollout`.
 
     Returns:
         The phases. Differentiable in everything, the durations included.
     """
-    force, steps = _force("hybrid_rollout", taus, steps, 1)
-    options = dict(method=method, drift=drift, gravity=gravity, f_ext=f_ext)
+    force, steps = forces("hybrid_rollout", taus, steps, 1)
+    dial = preset(accuracy, method=method, drift=drift)
     pick = lambda member: jax.tree.map(lambda x: x[member], family)
     first = pick(members[0])
-    q, v = expect(first, q=q, v=v)
+    family, first, q, v, gravity, f_ext = dial.cast((family, first, *expect(first, q=q, v=v), gravity, f_ext))
     durations = jnp.asarray(durations, q.dtype)
     (count,) = durations.shape
     if jnp.shape(members) != (count,):
@@ -121,36 +131,9 @@ def hybrid_rollout(
         stay = lambda: (*state, none)
         chain, q, v, impulse = lax.cond(k == 0, stay, lambda: transfer(state[0], pick(member), *state[1:]))
         f = lambda i, t, q, v: force((k, i), t, q, v)
-        qs, vs = _phase(chain, q, v, f, t, duration / steps, **options)
+        qs, vs = march(chain, q, v, f, t, duration / steps, dial, gravity=gravity, f_ext=f_ext)
         path = jnp.concatenate([q[None], qs]), jnp.concatenate([v[None], vs])
         return (chain, qs[-1], vs[-1]), Phases(t, *path, impulse, chain)
 
     _, found = lax.scan(phase, (first, q, v), (jnp.arange(count), jnp.asarray(members), times, durations))
     return found
-
-
-def _phase(chain, q, v, force, times, dt, **options):
-    """States at the ends of the steps that start at times[:-1]."""
-
-    def advance(state, x):
-        i, t = x
-        state = step(chain, *state, lambda t, q, v: force(i, t, q, v), t, dt, **options)
-        return state, state
-
-    _, found = lax.scan(advance, (q, v), (jnp.arange(len(times) - 1), times[:-1]))
-    return found
-
-
-def _force(name, taus, steps, axis: int):
-    """The force in step i as a function of time and state, and the number of steps, along `axis` of an array."""
-    if callable(taus):
-        if steps is None:
-            raise ValueError(f"{name}: taus is a function; say how many steps with steps=.")
-        return (lambda i, t, q, v: taus(t, q, v)), steps
-    taus = jnp.asarray(taus)
-    if taus.ndim != axis + 2:
-        want = "[phases, steps, nv]" if axis else "[nt, nv]"
-        raise ValueError(f"{name}: taus has shape {taus.shape}; it is {want}, or a function (t, q, v).")
-    if steps not in (None, taus.shape[axis]):
-        raise ValueError(f"{name}: steps is {steps} and taus has {taus.shape[axis]} rows; leave steps out.")
-    return (lambda i, t, q, v: taus[i]), taus.shape[axis]

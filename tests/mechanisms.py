@@ -92,6 +92,27 @@ def andrews() -> tuple[sdyn.Robot, dict]:
     return robot, p
 
 
+def andrews_force(p):
+    """The drive and the spring of the squeezer, a function (t, q, v)."""
+
+    def force(t, q, v):
+        s, c = jnp.sin(q[2]), jnp.cos(q[2])
+        x, y = p["xb"] + p["sc"] * s + p["sd"] * c - p["xc"], p["yb"] - p["sc"] * c + p["sd"] * s - p["yc"]
+        length = jnp.hypot(x, y)
+        pull = -p["c0"] * (length - p["l0"]) / length
+        turn = x * (p["sc"] * c - p["sd"] * s) + y * (p["sd"] * c + p["sc"] * s)
+        return jnp.zeros(7, q.dtype).at[0].set(p["mom"]).at[2].set(pull * turn)
+
+    return force
+
+
+def double_pendulum() -> sdyn.Robot:
+    """Unit point masses on unit rods without mass; angles from straight down, the second relative to the first."""
+    ball = lambda name: sdyn.Link(name, 1.0, (0.0, -1.0, 0.0))
+    joints = [pin("a", "ground_bar", "upper", 0.0), pin("b", "upper", "lower", 0.0, -1.0)]
+    return sdyn.Robot([sdyn.Link("ground_bar", 0.0), ball("upper"), ball("lower")], joints, grounded=True)
+
+
 def two_arms() -> sdyn.Robot:
     """Two arms of seven joints on a free base; the first hand holds a target, which the second can hold too."""
     arm = lambda side, y: with_frame(sdyn.models.load("deos7").prefixed(side), f"{side}mount", f"{side}base", (0, y, 0))

@@ -210,7 +210,8 @@ def fake(status="solved", error=None):
     def plan(task, **options):
         if error:
             raise error
-        return types.SimpleNamespace(status=status, verdict="The hand cannot reach the target.", save=save)
+        verdict = f"The hand cannot reach the target ({options['accuracy']})."
+        return types.SimpleNamespace(status=status, verdict=verdict, save=save)
 
     return types.SimpleNamespace(load=lambda name: types.SimpleNamespace(name=name), plan=plan)
 
@@ -218,9 +219,9 @@ def fake(status="solved", error=None):
 def test_plan_says_the_verdict_and_where_the_files_are(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(cli, "_planners", fake)
     monkeypatch.chdir(tmp_path)
-    assert main(["plan", "grasp"]) == 0
+    assert main(["plan", "grasp", "--accuracy", "1e-6"]) == 0
     out = capsys.readouterr().out
-    assert "reach" in out and "out/grasp" in out and "plan.html" in out and "angles" in out
+    assert "reach" in out and "1e-6" in out and "out/grasp" in out and "plan.html" in out and "angles" in out
 
 
 @pytest.mark.parametrize("status", ["infeasible", "not converged"])

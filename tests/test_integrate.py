@@ -11,7 +11,8 @@ import pytest
 from structures import QUICKLY, close, packed, real, robot, state, states
 
 import sdyn
-from sdyn.integrate import METHODS, step
+
+METHODS = {"semi_implicit": 1, "rk4": 4, "variational": 2, "implicit": 4}
 
 FREE = ["one_body", "unbalanced_tree", "locked_tip_base", "screws", "all_kinds", "all_kinds_backwards", "paper37"]
 EQUATIONS = ["variational", "implicit"]  # the methods that solve some in each step, and take long to compile
@@ -176,8 +177,7 @@ def test_a_stiff_governor():
 
     @partial(jax.jit, static_argnums=(1, 2), **QUICKLY)
     def roll(dt, steps, method):
-        one = lambda _, x: step(chain, *x, force, 0.0, dt, method=method, gravity=gravity)
-        return jax.lax.fori_loop(0, steps, one, start)[0][1]
+        return sdyn.rollout(chain, *start, force, dt, steps=steps, method=method, gravity=gravity)[0][-1, 1]
 
     slide = roll(1.0 / steps, steps, "implicit")
     assert abs(slide - data["s"][100]) < 1e-6
@@ -217,7 +217,7 @@ def test_forces_as_a_function():
         sdyn.rollout(chain, x.q[0], x.v[0], lambda t, q, v: tau, 0.01)
     with pytest.raises(ValueError, match="leave steps out"):
         sdyn.rollout(chain, x.q[0], x.v[0], np.tile(tau, (3, 1)), 0.01, steps=4)
-    with pytest.raises(ValueError, match="there is no method 'euler'"):
+    with pytest.raises(ValueError, match="method is 'euler'"):
         sdyn.integrate(chain, x.q[0], x.v[0], tau, 0.01, method="euler")
 
 

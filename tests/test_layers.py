@@ -28,7 +28,7 @@ DEVICE = [
     ["kinematics", "rebase"],
     ["dynamics", "jacobians", "closures", "delassus", "partition", "constraints", "drift"],
     ["conditioning", "momentum", "params", "floating", "actuators"],
-    ["transition", "rosenbrock", "variational", "integrate"],
+    ["transition", "accuracy", "rosenbrock", "variational", "adaptive", "integrate", "march", "choose"],
     ["rollout", "diagnose"],
 ]
 LAST = [["reduce"], ["__init__"], ["compiled"], ["cli"], ["__main__"]]

@@ -75,15 +75,7 @@ def test_andrews():
     """The squeezer at 0.03 s, in quadruple precision."""
     robot, p = mechanisms.andrews()
     chain, data, names = sdyn.pack(robot), np.load(oracles.DATA / "andrews.npz"), mechanisms.ANDREWS
-
-    def force(t, q, v):
-        s, c = jnp.sin(q[2]), jnp.cos(q[2])
-        x, y = p["xb"] + p["sc"] * s + p["sd"] * c - p["xc"], p["yb"] - p["sc"] * c + p["sd"] * s - p["yc"]
-        length = jnp.hypot(x, y)
-        pull = -p["c0"] * (length - p["l0"]) / length
-        turn = x * (p["sc"] * c - p["sd"] * s) + y * (p["sd"] * c + p["sc"] * s)
-        return jnp.zeros(7).at[0].set(p["mom"]).at[2].set(pull * turn)
-
+    force = mechanisms.andrews_force(p)
     rows = slice(None, None, 10)
     q, v, want = (np.stack([data[x + end][rows] for x in names], 1) for end in ("", "_dot", "_ddot"))
     for method in ("proximal", "partition"):

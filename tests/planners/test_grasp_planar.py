@@ -28,6 +28,14 @@ def test_the_same_plan_twice_is_identical(plan):
         assert np.array_equal(a.q, b.q) and np.array_equal(a.v, b.v) and np.array_equal(a.tau, b.tau)
 
 
+@pytest.mark.slow
+def test_a_wanted_error_decides_the_grid(plan):
+    """The motion, integrated again by other code, is that close to the plan."""
+    found = planners.plan(plan.task, accuracy="1e-7", progress=False)
+    assert found.status == "solved" and found.certificate.worst("integrated again") <= 1e-7
+    assert found.info["options"]["accuracy"] in ("fast", "balanced", "accurate", "reference")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

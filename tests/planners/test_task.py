@@ -70,8 +70,15 @@ def test_a_file_or_name_that_is_not_there_is_named(tmp_path):
         planners.load(tmp_path / "mine.toml")
 
 
-@pytest.mark.parametrize(("option", "words"), [({"solver": "magic"}, "no solver"), ({"seeds": 0}, "seeds"),
-                                               ({"accuracy": "best"}, "'draft'")])  # fmt: skip
+BAD = [
+    ({"solver": "magic"}, "no solver"),
+    ({"seeds": 0}, "seeds"),
+    ({"accuracy": "best"}, "'balanced'"),
+    ({"accuracy": "-1"}, "'1e-6'"),
+]
+
+
+@pytest.mark.parametrize(("option", "words"), BAD)
 def test_bad_options_are_refused(option, words):
     with pytest.raises(planners.TaskError, match=words):
         planners.plan(planners.load("grasp"), progress=False, **option)
