@@ -63,8 +63,13 @@ def integrate(
 
 def step(chain, q, v, force, t, dt, dial: Accuracy, *, gravity=None, f_ext=None):
     """`integrate`, with the force (and f_ext, if it is callable) as a function of time and state, for every stage."""
-    dt, method = jnp.asarray(dt, chain.dtype), dial.method
-    project = isinstance(dial.drift, str)
+    project, method = isinstance(dial.drift, str), dial.method
+    if isinstance(dial.drift, int | float) and isinstance(dt, int | float) and abs(dial.drift * dt) > 1:
+        raise ValueError(
+            f"integrate: the Baumgarte rate times dt is {dial.drift * dt:g}; keep it at most 1, as steps blow up at 2 "
+            f"(semi_implicit) or 2.8 (rk4). Take a rate of {1 / abs(dt):g} or less, or drift='project'."
+        )
+    dt = jnp.asarray(dt, chain.dtype)
     options = dict(gravity=gravity) | ({} if project else dict(baumgarte=dial.drift))
     wrenches = f_ext if callable(f_ext) else lambda t, q, v: f_ext
 
