@@ -6,7 +6,7 @@ difference: at a mass ratio of 1e8 errors fall from 4e-9 to 2e-15, and from garb
 
 SMALL = 1e-5
 """Share of the heaviest body's mass below which a base is too light. Down to there, one step of refinement restores
-the digits in float64, see `aba.py`, and costs less: the other base takes 3.5 times as long (37-DOF robot, batch 256)."""
+the digits in float64, see `aba.py`, and costs less: the other base takes 3.5 times as long (37 joints, batch 256)."""
 
 
 def better_base(robot) -> str | None:
