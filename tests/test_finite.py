@@ -43,11 +43,20 @@ def random_robot(seed) -> sdyn.Robot:
     robot = robot.lock({name: rng.choice([0.0, np.pi, 0.7]) for name in turning if rng.random() < 0.25})
     if seed % 3 == 2:
         robot = robot.ground(robot.base, [0.3, -0.2, 0.5, 0.5, 0.5, -0.5, 0.5])
+    q = closed_at(robot)
     if seed % 2:
-        robot = robot.close("c6", "c3", rng.choice(["point", "weld", "universal", "revolute"]), name="first")
+        robot = robot.close("c6", "c3", rng.choice(["point", "weld", "universal", "revolute"]), name="first", q=q)
     if seed % 4 == 3:
-        robot = robot.close("e1", "c5", "point", name="second")
+        robot = robot.close("e1", "c5", "point", name="second", q=q)
     return robot
+
+
+def closed_at(robot):
+    """A configuration; the closures keep the relative poses that it has."""
+    q = np.random.default_rng(robot.nv).normal(size=robot.nq)
+    for at in quaternions(robot):
+        q[at] /= np.linalg.norm(q[at])
+    return q
 
 
 @cache
@@ -71,12 +80,15 @@ def size():
 
 
 def states(robot):
-    """Padded q and v [STATES, ...]: random, at rest at zero, moving at zero, all at pi, fast, attitudes with w = 0."""
+    """Padded q and v of: a closed state, rest at zero, motion at zero, all at pi, fast with w = 0, almost closed."""
     rng = np.random.default_rng(len(robot.joints) + robot.nv)
     q, v = rng.normal(size=(STATES, robot.nq)), rng.normal(size=(STATES, robot.nv))
     q[1:3], q[3], v[1], v[4] = 0, np.pi, 0, 10 * v[4]
     for at in quaternions(robot):
-        q[:, at] = [unit(rng, 4), *np.eye(4)[[0, 0, 1]], unit(rng, 4), np.eye(4)[3]]
+        q[:, at] = [unit(rng, 4), *np.eye(4)[[0, 0, 1]], np.eye(4)[3], unit(rng, 4)]
+    q[0] = q[5] = closed_at(robot)
+    for joint, name in enumerate(robot.q_names):
+        q[5, joint] += 1e-3 * np.sin(joint) * (".q" not in name)
     chain = sdyn.pack(robot, size(), dtype="float64")
     return chain, *sdyn.pad(chain, q, v)
 
@@ -127,6 +139,7 @@ ELSEWHERE = {  # and where
     "hybrid_rollout", "growth",  # rollouts
     "pad", "unpad", "pack", "capacity", "family", "load", "save", "reduce",  # host stage
 }  # fmt: skip
+CLOSED = {"project", "integrate"}  # of states that are closed, or almost
 SINGULAR = {  # where the gradient has no meaning: its value alone is searched
     "reaction_null_space",  # jumps where the rank changes, and random states have no rank in common
 }
@@ -161,5 +174,6 @@ def test_nothing_is_nan(name):
         chain, q, v = states(robot)
         for path, x in jax.tree_util.tree_leaves_with_path(search(chain, q, v)):
             wrong = np.flatnonzero(~np.isfinite(np.asarray(x)).reshape(STATES, -1).all(1))
-            bad += [(k, int(state), jax.tree_util.keystr(path)) for state in wrong]
+            mine = [0, 5] if name in CLOSED else range(STATES)
+            bad += [(k, int(state), jax.tree_util.keystr(path)) for state in wrong if state in mine]
     assert not bad, f"{len(bad)} entries, the first (robot, state, place): {bad[:6]}"
