@@ -28,6 +28,8 @@ def contenders(chain, dt, gentle) -> dict:
         "semi-implicit": Accuracy("semi_implicit", dtype="float64"),
         "RK4": Accuracy(dtype="float64"),
         "RK4, float32": Accuracy(dtype="float32"),
+        "RK4, link frame": Accuracy(dtype="float64", frame="link"),
+        "RK4, float32, link frame": Accuracy(dtype="float32", frame="link"),
         "implicit": Accuracy("implicit", dtype="float64"),
         "adaptive": Accuracy("adaptive", dtype="float64", derivatives="recomputed"),
     }

@@ -4,11 +4,12 @@ Presets are points of the measured front, see `benchmarks/results/accuracy.png`;
 point by `choose`, on the scene at hand.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 
+from sdyn.chain import Chain
 from sdyn.checks import RobotError
 
 METHODS = {"semi_implicit": 1, "rk4": 4, "variational": 2, "implicit": 4, "adaptive": 8}
@@ -25,8 +26,8 @@ class Accuracy:
     """Steps of the method in each step of the rollout."""
     dtype: str | None = None
     """float32 or float64; the chain's if left out."""
-    frame: str = "common"
-    """Axes of the sweeps: "common", the base's."""
+    frame: str | None = None
+    """Axes of the sweeps, "common" or "link", see `pack`; the chain's if left out."""
     loops: str = "proximal"
     """Solver of closed chains, see `constrained_dynamics`."""
     drift: str | float = "project"
@@ -39,8 +40,8 @@ class Accuracy:
 
     def __post_init__(self):
         allowed = dict(
-            method=METHODS, dtype=(None, "float32", "float64"), frame=("common",), loops=("proximal", "partition"),
-            derivatives=("stored", "recomputed"),
+            method=METHODS, dtype=(None, "float32", "float64"), frame=(None, "common", "link"),
+            loops=("proximal", "partition"), derivatives=("stored", "recomputed"),
         )  # fmt: skip
         for name, values in allowed.items():
             if (value := getattr(self, name)) not in values:
@@ -52,13 +53,21 @@ class Accuracy:
             raise RobotError(f"accuracy: substeps is {self.substeps}; it must be at least 1.")
 
     def cast(self, tree):
-        """Arrays of floating-point type, in the dial's."""
+        """Chains in the dial's frame, and all floating-point arrays in its type."""
+        if self.frame is not None:
+            chain = lambda x: isinstance(x, Chain)
+            tree = jax.tree.map(lambda x: _framed(x, self.frame) if chain(x) else x, tree, is_leaf=chain)
         if self.dtype is None:
             return tree
         if self.dtype == "float64" and not jax.config.jax_enable_x64:
             raise RobotError('accuracy: float64 is off; call jax.config.update("jax_enable_x64", True) first.')
         floating = lambda x: hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)
         return jax.tree.map(lambda x: jnp.asarray(x, self.dtype) if floating(x) else x, tree)
+
+
+def _framed(chain, frame):
+    inner = None if chain.inner is None else _framed(chain.inner, frame)
+    return replace(chain, inner=inner, capacity=replace(chain.capacity, frame=frame))
 
 
 PRESETS = {

@@ -24,7 +24,7 @@ def test_the_reference_on_andrews():
 
 
 def test_what_a_dial_means():
-    """Substeps divide the step; the type is that of the dial; gradients that are recomputed are the same."""
+    """Substeps divide the step; frame and type are those of the dial; gradients that are recomputed are the same."""
     model = tree(UNBALANCED[:3])
     chain, x = sdyn.pack(model), states(model, "dial")
     taus = 0.1 * np.ones((4, chain.nv))
@@ -34,6 +34,8 @@ def test_what_a_dial_means():
         coarse = jax.jit(partial(roll, taus, accuracy=accuracy), **QUICKLY)()
         for a, b in zip(coarse, fine, strict=True):
             close(a, b[::2], 1e-14)
+    other = jax.jit(partial(roll, taus, accuracy=sdyn.Accuracy(substeps=2, frame="link")), **QUICKLY)()
+    close(other[0], fine[0][::2], 1e-13)
     single = jax.jit(partial(roll, taus, accuracy="fast"), **QUICKLY)()
     assert single[0].dtype == np.float32
     close(single[0], roll(taus, accuracy="balanced")[0], 1e-5)
