@@ -1,4 +1,5 @@
-"""What forward dynamics costs as the work grows: joints, batch, depth and width, padding, blocks, frames; the memory.
+"""What forward dynamics costs as the work grows: joints, batch, depth and width, padding, blocks,
+what a batch shares, frames; and the memory.
 
     python benchmarks/growth.py
 
@@ -97,6 +98,34 @@ def by_padding():
     }
 
 
+def by_sharing(batch=64):
+    """A batch that shares its structure and parameters; with masses of its own each; and a structure each."""
+    import contenders
+    import jax
+    import jax.numpy as jnp
+    import peers
+    import subjects
+
+    import sdyn
+
+    robot = subjects.compared()["paper37"]
+    chain, x = sdyn.pack(robot), peers.states(robot, batch)
+    masses = jnp.linspace(0.9, 1.1, batch)[:, None] * chain.link_mass
+    each, many = jax.vmap(sdyn.forward_dynamics), sdyn.family([robot] * batch)
+
+    def one(mass, *x):
+        params = sdyn.Params(mass, chain.link_com, chain.link_inertia)
+        return sdyn.forward_dynamics(sdyn.with_params(chain, params), *x)
+
+    heavier = lambda masses, x: jax.vmap(one)(masses, *x)
+    run = {
+        "all shared": contenders.forward(robot, batch),
+        "parameters each": harness.Contender(harness.loop(heavier, masses, x), batch),
+        "a structure each": harness.Contender(harness.loop(lambda chains, x: each(chains, *x), many, x), batch),
+    }
+    return measured(run)
+
+
 def by_frame(batch=64):
     """Common frame and links' frames, float64 and float32: time, and error against the links' frames in float64."""
     import contenders
@@ -178,7 +207,7 @@ def long_chain(few=100, many=1000, batch=16) -> dict:
 
 def show(result):
     """Print the medians."""
-    for key in ("joints", "batch", "block"):
+    for key in ("joints", "batch", "block", "sharing"):
         print(f"by {key} [us a sample]:", ", ".join(f"{n}: {x['median_us']:.2f}" for n, x in result[key].items()))
     for batch, times in result["padding"].items():
         print(f"{batch}, by padding:", ", ".join(f"{n}: {x['median_us']:.2f}" for n, x in times.items()))
@@ -226,7 +255,7 @@ def main():
     """Measure, save, show."""
     harness.one_thread()
     result = dict(what="time per sample of forward dynamics, one thread on one core", **harness.machine())
-    for f in (by_joints, by_batch, by_shape, by_padding, by_block, by_frame):
+    for f in (by_joints, by_batch, by_shape, by_padding, by_block, by_sharing, by_frame):
         key = f.__name__.removeprefix("by_")
         print(f"by {key}", flush=True)
         result[key] = f()

@@ -138,6 +138,16 @@ class Pinocchio:
             out[k, self.v_at] = self.pin.aba(self.model, self.data, *state)
         return out
 
+    def jacobians(self):
+        """Derivatives [count, 3, nv, nv] by increments of q as sdyn's, by v and by tau."""
+        out = np.empty((len(self.q), 3, *self.v.shape[1:] * 2))
+        for k, state in enumerate(zip(self.q, self.v, self.tau, strict=True)):
+            for J, found in zip(out[k], self.pin.computeABADerivatives(self.model, self.data, *state), strict=True):
+                J[np.ix_(self.v_at, self.v_at)] = found
+        R = rotations(self.q[:, [6, 3, 4, 5]])  # pin moves the base in its own axes
+        out[:, 0, :, 3:6] = out[:, 0, :, 3:6] @ R.swapaxes(1, 2)
+        return out
+
 
 class MuJoCo:
     """C (`mujoco`): free joint, linear part in world axes; nothing collides, no gravity, no constraint."""

@@ -37,7 +37,8 @@ def present(kinds):
 
 
 def agreement(robot, kinds) -> tuple[dict, dict]:
-    """Largest difference of accelerations from ours, relative to the largest; and who fails, with the reason."""
+    """Largest difference of accelerations from ours, relative to the largest, and of Pinocchio's derivatives; and who
+    fails, with the reason."""
     import jax
     import numpy as np
     import peers
@@ -51,7 +52,16 @@ def agreement(robot, kinds) -> tuple[dict, dict]:
     errors["sdyn, float32"] = error(fd(sdyn.pack(robot, dtype="float32"), *(x.astype("f4") for x in (q, v, tau))))
     for kind in kinds:
         try:
-            errors[kind.name] = error(kind(merged, q, v, tau).vdot())
+            peer = kind(merged, q, v, tau)
+            errors[kind.name] = error(peer.vdot())
+            if hasattr(peer, "jacobians"):
+                _, *mine = jax.jit(jax.vmap(sdyn.forward_dynamics_jacobians, (None, 0, 0, 0)))(
+                    sdyn.pack(robot), q, v, tau
+                )
+                pairs = zip(mine, peer.jacobians().swapaxes(0, 1), strict=True)
+                errors[f"{kind.name}, derivatives"] = max(
+                    float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs
+                )
         except Exception as reason:  # what goes wrong in a peer is reported, and the others go on
             failed[kind.name] = f"{type(reason).__name__}: {reason}".splitlines()[0]
     return errors, failed

@@ -19,9 +19,11 @@ def show(result):
     say(f"{result['cpu']}, one thread on one core of {result['cores']}, load {result['load']}; {versions}")
     for peer, reason in result["absent"].items():
         say(f"{peer} was left out: {reason}")
-    worst = max(x for errors in result["agreement"].values() for k, x in errors.items() if "float32" not in k)
+    rows = [row for errors in result["agreement"].values() for row in errors.items()]
+    worst = max(x for name, x in rows if "," not in name)
+    slopes = max((x for name, x in rows if "derivatives" in name), default=float("nan"))
     single = max(errors["sdyn, float32"] for errors in result["agreement"].values())
-    say(f"accelerations agree to {worst:.0e} (float32: {single:.0e}) of the largest one")
+    say(f"accelerations agree to {worst:.0e} (float32: {single:.0e}) of the largest one, derivatives to {slopes:.0e}")
     console.print(_ratios(result))
     console.print(_times(result))
     cold, change, long = result["cold_compile"], result["structure_change"], result["long_chain"]

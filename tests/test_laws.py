@@ -331,6 +331,17 @@ def test_nested_batches_that_share_operands():
         close(got[i, j, k], want, 3e-14)  # 2.2e-15
 
 
+def test_bad_sample_stays_alone():
+    """In a batch of several blocks, which use the same storage: one sample that is not a number spoils no other."""
+    x, chain = state("unbalanced_tree"), packed("unbalanced_tree")
+    q, v, tau = (jnp.tile(y, (75, 1)) for y in x[:3])
+    f = jax.jit(jax.vmap(jax.value_and_grad(lambda *x: sdyn.forward_dynamics(chain, *x).sum(), (0, 1, 2))), **QUICKLY)
+    whole, one_bad = f(q, v, tau), f(q, v.at[0].set(jnp.nan), tau)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(one_bad), strict=True):
+        assert not np.isfinite(b[0]).all()
+        np.testing.assert_array_equal(a[1:], b[1:])
+
+
 def test_without_jit():
     x, chain = state("all_kinds_backwards"), packed("all_kinds_backwards")
     close(fd(chain, *(y[0] for y in x[:5])), accelerations("all_kinds_backwards")[0], 3e-14)  # 2.1e-15
