@@ -337,8 +337,8 @@ def test_bad_sample_stays_alone():
     q, v, tau = (jnp.tile(y, (75, 1)) for y in x[:3])
     f = jax.jit(jax.vmap(jax.value_and_grad(lambda *x: sdyn.forward_dynamics(chain, *x).sum(), (0, 1, 2))), **QUICKLY)
     whole, one_bad = f(q, v, tau), f(q, v.at[0].set(jnp.nan), tau)
+    assert np.isnan(one_bad[0][0])
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(one_bad), strict=True):
-        assert not np.isfinite(b[0]).all()
         np.testing.assert_array_equal(a[1:], b[1:])
 
 
