@@ -14,7 +14,7 @@ Derivatives are kernels too, made by AD of the kernel's function or by its own `
 """
 
 import math
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +85,20 @@ def _abstract(*operands, kernel):
 
 def _shaped(kernel, operands):
     """Shapes and types of the outputs."""
-    return jax.eval_shape(kernel.run, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands))
+    return _seen(kernel, *((x.shape, x.dtype) for x in operands))[0]
+
+
+def _storages(kernel, operands):
+    """Shapes and types of the storages that the kernel asks for."""
+    return _seen(kernel, *((x.shape, x.dtype) for x in operands))[1]
+
+
+@cache
+def _seen(kernel, *sizes):
+    """Shapes and types of outputs and storages; what follows from shapes is traced once."""
+    work = Workspace()
+    out = jax.eval_shape(partial(kernel.run, work=work), *(jax.ShapeDtypeStruct(*size) for size in sizes))
+    return out, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in work.storages]
 
 
 # ---- columns of samples ----------------------------------------------------------------------------------------------
@@ -155,13 +168,6 @@ def _blocked(*operands, kernel):
         blocks, one = jnp.where(index.ravel()[0] >= 0, blocks, 0), jnp.where(index.ravel()[0] >= 0, one, 0)
     empty = tuple(jnp.zeros((*x.shape[:-1], B // s, s), x.dtype) for x in shaped)
     return tuple(y.reshape(x.shape) for x, y in zip(shaped, lax.fori_loop(0, one, all_blocks, empty), strict=True))
-
-
-def _storages(kernel, operands):
-    """Shapes and types of the storages that the kernel asks for."""
-    work = Workspace()
-    jax.eval_shape(lambda *x: kernel.run(*x, work=work), *operands)
-    return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in work.storages]
 
 
 def _even(n: int, most: int) -> int:
