@@ -76,7 +76,9 @@ def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G,
     free, walk, structure = base_value[BaseRow.FREE], walk_of(slot_index, work), (slot_index, slot_value, base_value)
     held = -G * (1 - free) if G.shape[0] else jnp.zeros_like(V0)  # a free base falls with the rest
     joints = joints_of(walk, slot_index, slot_value, q, quat, link)
-    hinges, S, f, blocks, bodies = _moving(walk, joints, base_value, V0 * free, qd, held, B, saving)
+    R, p, S, V, A, f, blocks, bodies = moving(walk, joints, base_value, V0 * free, qd, held, B, saving)
+    walk.work.release(V, A)
+    hinges = (R, p) if link else None
     factor = articulated(walk, S, blocks, rotor, free, B, hinges)
     f = loaded(walk, joints, f, F, B)
     a0, qdd = solve(walk, S, factor, f, f0 * free, tau, free, rotor.shape[0], hinges)
@@ -98,8 +100,9 @@ def _aba(slot_index, slot_value, base_value, rotor, q, quat, V0, qd, f0, tau, G,
     return (a0, qdd, flat(bodies), cat(factor[:2], 1), factor.base) if saving else (a0, qdd)
 
 
-def _moving(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving: bool):
-    """Hinges and axes S, forces at zero accelerations and inertia blocks of all bodies; the bodies, if `saving`."""
+def moving(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving: bool):
+    """Poses, axes S, twists, accelerations and forces at zero q̈, and inertia blocks of all bodies; the bodies, if
+    `saving`."""
     of_pose = lambda R, p: (R, p) if joints.link else None
 
     def values(V, A, m, h, Io):
@@ -113,9 +116,8 @@ def _moving(walk: Walk, joints: Joints, base_value, V0, qd, A0, B: tuple, saving
 
     more = (walk.empty(len(x), B, V0.dtype, x) for x in values(V0, A0, *base_inertia(base_value)))
     R, p, S, V, A, f, *blocks = placed(walk, joints, B, body, tuple(more))
-    walk.work.release(V, A)
     bodies = Bodies(S, *blocks[3:], masses(walk, joints, base_value)) if saving else None
-    return of_pose(R, p), S, f, blocks[:3], bodies
+    return R, p, S, V, A, f, blocks[:3], bodies
 
 
 def _mass_solve(slot_index, slot_value, base_value, rotor, q, quat, saved, factor, base, b0, b, *, work, link=False):
@@ -163,7 +165,14 @@ def articulated(walk: Walk, S, blocks, rotor, free, B: tuple, hinges) -> Factor:
 
 def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int, hinges=None):
     """Accelerations (a0 [6, B], qdd [nv, B]) from the forces f of the bodies, f0 on the base and tau [nv, B]."""
-    W, B = walk.width, f.shape[2:]
+    left, u = reduced(walk, S, factor, f, tau, hinges)
+    a0 = at_base(factor, f0 - left) * free
+    return a0, accelerated(walk, S, factor, a0, u, nv, hinges)
+
+
+def reduced(walk: Walk, S, factor: Factor, f, tau, hinges=None):
+    """The force that reaches the base [6, B], and u [T, W, B]."""
+    W = walk.width
 
     def inward(t, parents, stored):
         f, us = stored
@@ -171,15 +180,26 @@ def solve(walk: Walk, S, factor: Factor, f, f0, tau, free, nv: int, hinges=None)
         u = keep(walk.of_step(tau, t) - dot(block(S, t, W), here))
         return add_to(f, parents, up(hinge(hinges, t, W), here + block(factor.G, t, W) * u)), put_step(us, t, u)
 
+    f, u = walk.inward(inward, (f, walk.work.empty((*walk.live.shape, *f.shape[2:]), f.dtype)))
+    return f[walk.slots], u
+
+
+def at_base(factor: Factor, f0):
+    """IA₀⁻¹ f₀."""
+    return solve6(factor.base[:6], factor.base[6:15], factor.base[15:], f0)
+
+
+def accelerated(walk: Walk, S, factor: Factor, a0, u, nv: int, hinges=None):
+    """q̈ [nv, B] from the acceleration of the base and u."""
+    W, B = walk.width, u.shape[2:]
+
     def outward(t, parents, stored):
         a, x = stored
         before = keep(down(hinge(hinges, t, W), take(a, parents)))
         qdd = keep(at(u, t) * block(factor.Dinv, t, W)[0] - dot(block(factor.G, t, W), before))
         return put(a, t, W, before + block(S, t, W) * qdd), walk.put_dof(x, t, qdd)
 
-    f, u = walk.inward(inward, (f, walk.work.empty((*walk.live.shape, *B), f.dtype)))
-    a0 = solve6(factor.base[:6], factor.base[6:15], factor.base[15:], f0 - f[walk.slots]) * free
-    return a0, walk.outward(outward, (walk.empty(6, B, f.dtype, a0), walk.dofs(nv, B, f.dtype)))[1][:nv]
+    return walk.outward(outward, (walk.empty(6, B, u.dtype, a0), walk.dofs(nv, B, u.dtype)))[1][:nv]
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------

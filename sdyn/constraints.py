@@ -4,8 +4,8 @@ Two solvers share no step: the Delassus matrix, see `delassus.py`, and the paper
 `partition.py`. Neither is differentiated by AD: where
 r = [ID(q, v, v̇) − Kᵀ lam − τ; K v̇ − k] is zero,
     [M −Kᵀ; K 0] [dv̇; dlam] = −dr  along every change of state, parameters or closures,
-with dr from inverse dynamics under the closures' wrenches and from one sweep of accelerations. It holds for redundant
-closures too, along motions that keep them closed: there dv̇ is unique although K has dependent rows.
+with dr from inverse dynamics under the closures' wrenches and from the accelerations of their frames. It holds for
+redundant closures too, along motions that keep them closed: there dv̇ is unique although K has dependent rows.
 """
 
 from dataclasses import dataclass
@@ -16,10 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sdyn.chain import Chain, ClosureRow
-from sdyn.closures import closure_acceleration, closure_forces, loop_jacobian, loop_residual
-from sdyn.delassus import delassus
-from sdyn.delassus import solve as delassus_solve
-from sdyn.dynamics import inverse_dynamics, inverse_dynamics_under, tree_dynamics
+from sdyn.closures import (
+    closed_operands,
+    closure_acceleration,
+    closure_forces,
+    loop_jacobian,
+    loop_residual,
+    system_of,
+)
+from sdyn.coordinates import join, rates_of, spin
+from sdyn.delassus import Saved, closed_aba, closed_aba_saving
+from sdyn.dynamics import inverse_dynamics, inverse_dynamics_under, passive_force, tree_dynamics
 from sdyn.inputs import expect
 from sdyn.partition import Partition, condition, partition
 from sdyn.partition import solve as partition_solve
@@ -84,7 +91,7 @@ def forward_dynamics(
     if chain.capacity.rows == 0:
         return tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    return _held(chain, q, v, tau, gravity, f_ext, baumgarte, None)[0]
+    return _held(closed_aba, chain, q, v, tau, gravity, f_ext, _feedback(chain, q, v, baumgarte))[0]
 
 
 def constrained_dynamics(
@@ -110,8 +117,8 @@ def constrained_dynamics(
     Returns:
         vdot: As of `forward_dynamics`.
         lam: One entry per row of the closures, the wrench on frame a in the axes and at the origin of frame a [N m,
-            N]; where it is not unique, the one with the least sum of squares. Its derivative is exact where the
-            redundancy does not turn with q, as with a closure stated twice; vdot and its derivative always are.
+            N]; where it is not unique, the one with the least sum of squares. Where the redundancy turns with q, only
+            the first derivative by the default method is exact; the derivatives of vdot always are.
         status: See `Status`.
 
     Source:
@@ -120,11 +127,15 @@ def constrained_dynamics(
     if method not in ("proximal", "partition"):
         raise ValueError(f"constrained_dynamics: there is no method {method!r}; they are 'proximal' and 'partition'.")
     q, v, tau, gravity, f_ext = expect(chain, q=q, v=v, tau=tau, gravity=gravity, f_ext=f_ext)
-    if method == "partition" and pairs is None:
-        pairs = partition(*jax.lax.stop_gradient((chain, q)))
-    pairs = pairs if method == "partition" else None
-    vdot, lam = _held(chain, q, v, tau, gravity, f_ext, baumgarte, pairs)
-    return vdot, lam, _status(*jax.lax.stop_gradient((chain, q, v, vdot)), pairs)
+    d = _feedback(chain, q, v, baumgarte)
+    if method == "proximal":
+        vdot, lam, *saved = _held(closed_aba_saving, chain, q, v, tau, gravity, f_ext, d)
+        pairs = None
+    else:
+        pairs = partition(*jax.lax.stop_gradient((chain, q))) if pairs is None else pairs
+        vdot, lam = _partitioned(chain, q, v, tau, gravity, f_ext, d, pairs)
+        saved = system_of(*jax.lax.stop_gradient((chain, q))).saved
+    return vdot, lam, _status(*jax.lax.stop_gradient((chain, q, v, vdot)), pairs, Saved(*saved))
 
 
 def constrained_inverse_dynamics(
@@ -176,41 +187,42 @@ def constrained_inverse_dynamics(
     return force - K.T @ lam, lam
 
 
-@partial(jax.custom_jvp)
-def _held(chain, q, v, tau, gravity, f_ext, baumgarte, pairs):
+def _feedback(chain, q, v, rate):
+    """K v̇ − k that Baumgarte asks for."""
+    if rate is None:
+        return jnp.zeros(chain.capacity.rows, q.dtype)
+    return -2 * rate * closure_acceleration(chain, q, jnp.zeros_like(v), v) - rate**2 * loop_residual(chain, q)
+
+
+def _held(kernel, chain, q, v, tau, gravity, f_ext, d):
+    """vdot and lam, and what the kernel saves."""
+    pose, structure, G, F = closed_operands(chain, q, gravity, f_ext)
+    V0, qd = rates_of(chain, pose, v)
+    f0, force = rates_of(chain, pose, tau)
+    force = force - passive_force(chain, pose, qd)
+    a0, qdd, lam, *saved = kernel(*structure, V0, qd, f0, force, G, F, d[:, None])
+    return join(chain, pose, a0, qdd + spin(chain, qd)), lam[:, 0], *saved[1:]
+
+
+@jax.custom_jvp
+def _partitioned(chain, q, v, tau, gravity, f_ext, d, pairs):
     """vdot and lam."""
-    if pairs is not None:
-        rest = jnp.zeros_like(v)
-        c = tau - inverse_dynamics(chain, q, v, rest, gravity=gravity, f_ext=f_ext)
-        return partition_solve(chain, q, pairs, c, -_opening(chain, q, v, rest, baumgarte))
-    free = tree_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
-    system = delassus(chain, q)
-    lam = system.multipliers(-_opening(chain, q, v, free, baumgarte))
-    return free + system.Y @ lam, lam
+    rest = jnp.zeros_like(v)
+    c = tau - inverse_dynamics(chain, q, v, rest, gravity=gravity, f_ext=f_ext)
+    return partition_solve(chain, q, pairs, c, d - closure_acceleration(chain, q, v, rest))
 
 
-@partial(_held.defjvp, symbolic_zeros=True)
-def _held_tangent(primals, tangents):
+@partial(_partitioned.defjvp, symbolic_zeros=True)
+def _partitioned_tangent(primals, tangents):
     (chain, q), pairs = primals[:2], primals[-1]
-    vdot, lam = _held(*primals)
+    vdot, lam = _partitioned(*primals)
     c, d = _slope(lambda *x: _residual(*x, vdot, lam), primals[:-1], tangents[:-1])
-    if pairs is None:
-        return (vdot, lam), delassus_solve(chain, q, -c, -d)
     return (vdot, lam), partition_solve(chain, q, pairs, -c, -d)
 
 
-def _opening(chain, q, v, vdot, rate):
-    """K v̇ − k, and what Baumgarte adds."""
-    if rate is None:
-        return closure_acceleration(chain, q, v, vdot)
-    return closure_acceleration(chain, q, v, vdot + 2 * rate * v) + rate**2 * loop_residual(chain, q)
-
-
-def _residual(chain, q, v, tau, gravity, f_ext, baumgarte, vdot, lam):
+def _residual(chain, q, v, tau, gravity, f_ext, d, vdot, lam):
     F, opening = closure_forces(chain, q, v, vdot, lam)
-    if baumgarte is not None:
-        opening = _opening(chain, q, v, vdot, baumgarte)
-    return inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, F) - tau, opening
+    return inverse_dynamics_under(chain, q, v, vdot, gravity, f_ext, F) - tau, opening - d
 
 
 def _slope(function, primals, tangents):
@@ -228,17 +240,17 @@ def _slope(function, primals, tangents):
     return jax.jvp(f, tuple(leaves[i] for i in at), tuple(along[i] for i in at))[1]
 
 
-def closure_spectrum(chain, q):
+def closure_spectrum(saved: Saved):
     """Rank of the closures, their smallest singular value, and the largest over it: as in `Status`."""
-    system = delassus(chain, q)
-    count, eigenvalues = spectrum(system.G, system.dead, system.tolerance, system.share)
+    share, dead, tolerance = saved.judged[..., 0]
+    count, eigenvalues = spectrum(saved.G[0, ..., 0], dead, tolerance, share)
     sigma = jnp.sqrt(jnp.maximum(eigenvalues[::-1], 0))
     least = jnp.where(count > 0, sigma[jnp.maximum(count - 1, 0)], 1.0)
     return count, least, jnp.where(count > 0, sigma[0], 1.0) / least
 
 
-def _status(chain, q, v, vdot, pairs) -> Status:
-    count, least, ratio = closure_spectrum(chain, q)
+def _status(chain, q, v, vdot, pairs, saved: Saved) -> Status:
+    count, least, ratio = closure_spectrum(saved)
     drift = jnp.abs(loop_residual(chain, q)).max(initial=0.0)
     noise = jnp.maximum(drift, 64 * jnp.finfo(q.dtype).eps)
     live = jnp.sum(chain.row_index[ClosureRow.LIVE])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sdyn.chain import Chain
-from sdyn.closures import loop_residual
+from sdyn.closures import loop_residual, system_of
 from sdyn.conditioning import Trust, conditioning
 from sdyn.constraints import closure_spectrum
 from sdyn.coordinates import quaternions_of
@@ -110,7 +110,7 @@ def _of_state(chain, q, v, gravity):
     opening, sigma = jnp.zeros_like(energy), jnp.ones_like(energy)
     if chain.capacity.rows:
         opening = jnp.abs(loop_residual(chain, q)).max()
-        _, sigma, _ = closure_spectrum(chain, q)
+        _, sigma, _ = closure_spectrum(system_of(chain, q).saved)
     return quantity, momentum(chain, q, v), energy, opening, condition, trust, sigma
 
 

@@ -3,14 +3,14 @@
 With S = G⁺, one step is q ← q − M⁻¹ Kᵀ S φ(q), and v ← v − M⁻¹ Kᵀ S K v: the closest state in kinetic energy.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from sdyn.chain import Chain
-from sdyn.closures import loop_jacobian, loop_residual
+from sdyn.closures import System, closure_acceleration, loop_residual, system_of
 from sdyn.coordinates import increment_rate, retract
-from sdyn.delassus import delassus
 from sdyn.inputs import expect
 
 STEPS = 8  # of Newton's method in `project`: from 0.3 rad and 0.1 m to rounding in 5
@@ -33,27 +33,29 @@ def project(
     if chain.capacity.rows == 0:
         return q, v
 
-    def step(q, _):
-        system = delassus(chain, q)
-        return _moved(chain, q, system), None
+    def step(state, _):
+        q, _ = state
+        at, change = _step(chain, q, v, system_of(chain, q))
+        return (at, v + change), None
 
-    q, _ = lax.scan(step, q, None, STEPS)
-    system = delassus(chain, q)
-    return q, v + system.Y @ system.multipliers(-(system.K @ v))
+    return lax.scan(step, (q, v), None, STEPS)[0]
 
 
 def corrected(chain: Chain, q, v):
-    """The state after a step, closed again, with the matrices of one configuration.
+    """The state after a step, closed again, with the matrices of one configuration: two steps leave the square of the
+    drift."""
+    system = system_of(chain, q)
 
-    Two steps for q and one for v leave the square of the drift. The derivative is the implicit one of a closed state:
-    the matrices are held fixed, which neglects the drift times theirs.
-    """
-    system = lax.stop_gradient(delassus(chain, q))
-    for _ in range(2):
-        q = _moved(chain, q, system)
-    return q, v + system.Y @ system.multipliers(-(loop_jacobian(chain, q) @ v))
+    def step(state, _):
+        q, change = _step(chain, *state, system)
+        return (q, state[1] + change), None
+
+    return lax.scan(step, (q, v), None, 2)[0]
 
 
-def _moved(chain, q, system):
-    step = system.Y @ system.multipliers(-loop_residual(chain, q))
-    return retract(chain, q, increment_rate(chain, q, jnp.zeros_like(step), step))
+def _step(chain, q, v, system: System):
+    """q after a step, and the change of v, by one solution for both."""
+    still = jnp.zeros_like(v)
+    open_by = jnp.stack([loop_residual(chain, q), closure_acceleration(chain, q, still, v)])
+    step, change = jax.vmap(lambda d: system.solve(still, d)[0])(-open_by)
+    return retract(chain, q, increment_rate(chain, q, still, step)), change

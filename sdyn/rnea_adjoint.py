@@ -65,7 +65,7 @@ def adjoint(*operands, parameters, work):
         b = keep(Bv - keep(force_cross(V, A)))
         if more:
             of_S = keep(walk.of_step(c, t) * fh + qd * b + walk.of_step(motion.qdd, t) * A)
-            found = [_geometry(motion, t, parents, g, of_S)]
+            found = [geometry(motion, t, parents, g, of_S)]
             found += [_inertial(motion, t, block(ws, t, W))] if parameters else []
             more = tuple(put(y, t, W, z) for y, z in zip(more, found, strict=True))
         sums = tuple(add_to(y, parents, z) for y, z in zip((f, As, Bs, *T), (fh, A, up, *Th), strict=True))
@@ -77,7 +77,7 @@ def adjoint(*operands, parameters, work):
     more = tuple(walk.empty(k, B, dtype) for k in more)
     f, As, Bs, *T, of_q, of_qd, of_qdd, more = walk.inward(inward, (f, As, Bs, *T, empty, empty, empty, more))
     none = jnp.zeros((0, *B), dtype)
-    of_quat = _of_quaternions(x, walk, more[0][:, 39:]) if spherical else none[:, None]
+    of_quat = of_quaternions(x, walk, more[0][:, 39:]) if spherical else none[:, None]
     A0, V0 = As[walk.slots], Bs[walk.slots] * free
     of_G = -A0 if x["G"].shape[0] else none
     of_F = -walk.cleared(ws) if wrench else none[:, None, None]
@@ -92,7 +92,7 @@ def adjoint(*operands, parameters, work):
     )  # fmt: skip
 
 
-def _geometry(motion: Motion, t, parents, g, of_S):
+def geometry(motion: Motion, t, parents, g, of_S):
     """Cotangents of the joint's constants but the inertia [39, W, B], and of a turn of the child in its axes [3, W, B].
 
     g is the cotangent of a motion of the joint's frame: a turn of R by theta and a shift of p by x are the motion
@@ -141,7 +141,7 @@ def _of_base(base_value, w, V, A):
     return cat([found, jnp.zeros((len(base_value) - 13, *found.shape[1:]), found.dtype)])
 
 
-def _of_quaternions(x, walk: Walk, turn):
+def of_quaternions(x, walk: Walk, turn):
     """Cotangents (2 / |q|²) q o [0; theta] of the quaternions, from those of the turns of the slots."""
     of_slot, index = turn[: walk.slots], x["slot_index"][SlotRow.QUAT].reshape(-1)
     n = len(x["quat"])

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sdyn.chain import BaseRow, Chain, ClosureRow, JointRow, JointValue, LinkRow, LoopRow
-from sdyn.closures import at_links, ends_of, wrenches
+from sdyn.closures import at_links, closure_acceleration, frame_wrenches, frames_of, system_of
 from sdyn.coordinates import pose_of
-from sdyn.delassus import delassus
 from sdyn.dynamics import solve_mass
 from sdyn.inputs import expect
 from sdyn.kinematics import jacobian_columns, link_motions, poses
@@ -232,9 +231,9 @@ def _jump(chain, q, v0, R, p, V, held, restitution):
     of_loops = jnp.zeros((0, 6), q.dtype)
     if chain.capacity.rows:
         more, lam = _stop(chain, q, v0 + dv, held, restitution)
-        ends, dv = ends_of(chain, pose, slots[..., 0]), dv + more
-        F = wrenches(chain, ends, lam)
-        h, of_loops = h + at_links(chain, F), about(F, ends.xa)
+        ends, dv = frames_of(chain, pose, slots[..., 0]), dv + more
+        F = frame_wrenches(chain, ends, lam)
+        h, of_loops = h + at_links(chain, F), about(F, ends.xa.T)
     dh = jnp.where(present, link_momenta(chain, Rb, pb, jnp.einsum("nkv,v->nk", J, dv)), 0) - h
     of_links = about(_subtree_sums(index[LinkRow.PARENT], dh), pb)
     return v0 + dv, jnp.concatenate([of_links, of_loops])
@@ -246,11 +245,12 @@ def _stop(chain, q, v, held, restitution):
     The rates at which new loops meet are those that the old ones allow; one factor for all of them keeps energy from
     growing.
     """
-    system = delassus(chain, q)
     new = ~held[chain.row_index[ClosureRow.LOOP]]
-    old = system.multipliers(-(system.K @ v), new.astype(q.dtype))
-    lam = system.multipliers(-(1 + restitution) * (system.K @ (v + system.Y @ old)))
-    return system.Y @ (old + lam), old + lam
+    still = jnp.zeros_like(v)
+    meeting = lambda v: closure_acceleration(chain, q, still, v)
+    first, old = system_of(chain, q, new.astype(q.dtype)).solve(still, -meeting(v))
+    more, lam = system_of(chain, q).solve(still, -(1 + restitution) * meeting(v + first))
+    return first + more, old + lam
 
 
 def _subtree_sums(parent, x):

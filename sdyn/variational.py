@@ -24,9 +24,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from sdyn.chain import Chain
-from sdyn.closures import loop_residual
+from sdyn.closures import closure_acceleration, loop_jacobian, loop_residual, system_of
 from sdyn.coordinates import increment_rate, join, on_rotations, pose_of, rates_of, retract
-from sdyn.delassus import delassus
 from sdyn.dynamics import inverse_dynamics, solve_mass
 from sdyn.momentum import centre_of_mass, total_mass
 from sdyn.rotation import exp, matrix
@@ -52,8 +51,8 @@ def variational_step(chain: Chain, q, v, force, wrenches, gravity, guess, t, dt)
     rows, start = chain.capacity.rows, _momenta(chain, q, v)
     w0, P0 = _split(chain, q, start)
     if rows:
-        system = delassus(chain, q)
-        of_w, of_P = jax.vmap(lambda row: _split(chain, q, _world(chain, q, row)))(system.K)
+        system, K = system_of(chain, q), loop_jacobian(chain, q)
+        of_w, of_P = jax.vmap(lambda row: _split(chain, q, _world(chain, q, row)))(K)
 
     def balance(x):
         """What (2), the path of the centre of mass and the closures miss, and how far the end is from where it goes."""
@@ -77,19 +76,18 @@ def variational_step(chain: Chain, q, v, force, wrenches, gravity, guess, t, dt)
     def solved(r):
         """x of the balance's slope times x = r, but for a share of about dt times the rates."""
         (missing, path, opening), end = r
-        x = solve_mass(chain, q, missing)
         if not rows:
-            return (x, path, opening), end
-        lam = system.multipliers(opening / jnp.where(dt == 0, 1, dt) - system.K @ (x + _carried(chain, q, path)))
+            return (solve_mass(chain, q, missing), path, opening), end
+        x, lam = system.solve(missing, opening / jnp.where(dt == 0, 1, dt) - K @ _carried(chain, q, path))
         push = lam @ of_w
-        return (x + system.Y @ lam - _carried(chain, q, push), path + push, lam), end
+        return (x - _carried(chain, q, push), path + push, lam), end
 
     middle = guess - _carried(chain, q, w0), w0, jnp.zeros(rows, q.dtype)
     _, (end, w, P) = _root(balance, solved, (middle, (q, w0, P0)))
     v = _with_momenta(chain, end, w, P, start)
     if rows:
-        system = delassus(chain, end)
-        v = v - system.Y @ system.multipliers(system.K @ v)
+        still = jnp.zeros_like(v)
+        v = v + system_of(chain, end).solve(still, -closure_acceleration(chain, end, still, v))[0]
     return end, v
 
 

@@ -1,7 +1,6 @@
 """Planar mechanisms of the literature as robots, and how far their states are from the reference data."""
 
 import json
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,19 +110,6 @@ def double_pendulum() -> sdyn.Robot:
     ball = lambda name: sdyn.Link(name, 1.0, (0.0, -1.0, 0.0))
     joints = [pin("a", "ground_bar", "upper", 0.0), pin("b", "upper", "lower", 0.0, -1.0)]
     return sdyn.Robot([sdyn.Link("ground_bar", 0.0), ball("upper"), ball("lower")], joints, grounded=True)
-
-
-def two_arms() -> sdyn.Robot:
-    """Two arms of seven joints on a free base; the first hand holds a target, which the second can hold too."""
-    arm = lambda side, y: with_frame(sdyn.models.load("deos7").prefixed(side), f"{side}mount", f"{side}base", (0, y, 0))
-    left, right, target = arm("l_", 0.0), arm("r_", 0.9), sdyn.models.load("sat50").prefixed("t_")
-    both = left.attach(right, "l_mount", "r_mount", name="bus")
-    target = with_frame(target, "handle", target.base, (0.2, -0.3, 0.1))
-    return both.attach(target, "l_hand", "t_grasp", name="held")
-
-
-def with_frame(robot, name, link, position):
-    return replace(robot, frames=(*robot.frames, sdyn.Frame(name, link, position=position)))
 
 
 def flyball():

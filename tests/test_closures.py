@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from mechanisms import four_bar, row_of_four_bars
+from mechanisms import bricard, four_bar, row_of_four_bars
 from structures import QUICKLY, UNBALANCED, body, close, rotation, tree, unit
-from test_gradients import differences
+from test_gradients import along_joints, differences
 
 import sdyn
 from sdyn.dynamics import tree_dynamics
@@ -99,7 +99,7 @@ def test_closure_is_the_joint_of_its_kind(kind, rng):
 
 
 def doubled():
-    """A four-bar in space, with a revolute closure, stated twice: ten rows, two of them independent."""
+    """A four-bar in space with a revolute closure, and with that stated twice: ten rows, two of them independent."""
     once = four_bar()
     loop = once.loops[0]
     return once, once.close(loop.frame_a, loop.frame_b, loop.kind, name="again")
@@ -110,52 +110,100 @@ def state():
     return [np.array([float(x) for x in data[key]]) for key in ("q", "qd", "tau")]
 
 
-def both(chain, q, v, tau, mass):
+def both(chain, method, q, v, tau, mass):
     chain = sdyn.with_params(chain, replace(sdyn.params(chain), mass=mass))
-    vdot, lam, status = sdyn.constrained_dynamics(chain, q, v, tau, gravity=GRAVITY)
+    vdot, lam, status = sdyn.constrained_dynamics(chain, q, v, tau, gravity=GRAVITY, method=method)
     return jnp.concatenate([vdot, lam]), status
 
 
-@partial(jax.jit, static_argnums=4, **QUICKLY)
-def derivatives(chain, w, x, along, order):
-    """Value, slope and gradient; for order 2 the slope of the gradient too."""
-    f = lambda *x: both(chain, *x)[0]
+@partial(jax.jit, static_argnums=(1, 5), **QUICKLY)
+def derivatives(chain, method, w, x, along, order):
+    """Slope and gradient; for order 2 the slope of the gradient too."""
+    f = lambda *x: both(chain, method, *x)[0]
     gradient = jax.grad(lambda *x: w @ f(*x), (0, 1, 2, 3))
     g, turned = jax.jvp(gradient, x, along) if order == 2 else (gradient(*x), None)
-    return *jax.jvp(f, x, along), g, turned
+    return jax.jvp(f, x, along)[1], g, turned
 
 
-BOTH = jax.jit(both, **QUICKLY)
+BOTH = jax.jit(both, static_argnums=1, **QUICKLY)
+SECOND = [pytest.param(2, method, marks=pytest.mark.slow) for method in ("proximal", "partition")]
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_closure_stated_twice(order, rng):
+@pytest.mark.parametrize(("order", "method"), [(1, "proximal"), *SECOND])
+def test_closure_stated_twice(order, method, rng):
     """The same accelerations and half the multiplier each; so are their first and second derivatives."""
-    once, twice = doubled()
-    w, x, out = rng.normal(size=3), state(), []
-    along = [rng.normal(size=3) for _ in range(3)]
-    for chain in map(sdyn.pack, (once, twice)):
+    size, at = sdyn.capacity(doubled()), np.arange(19) >= 6  # of v and lam, behind a base that is grounded
+    along, out = [np.r_[np.zeros(6 + (k == 0)), rng.normal(size=3)] for k in range(3)], []
+    w = at * np.r_[rng.normal(size=9), 0.3, -0.2, 0.0, 0.7, -0.9, np.zeros(5)]
+    for chain in (sdyn.pack(mine, size) for mine in doubled()):
+        q, v, tau = state()
         mass = np.asarray(chain.link_mass)
-        full = (*x, mass), (*along, mass * rng.uniform(size=4) if not out else out[0][1][3])
-        weights = np.r_[w, np.zeros(chain.capacity.rows)]
-        weights[3:8] = [0.3, -0.2, 0.0, 0.7, -0.9]
-        out.append(
-            (full[0], full[1], weights, chain, derivatives(chain, weights, *full, order), BOTH(chain, *full[0])[1])
-        )
-    (y1, s1, *_), (y2, s2, *_) = out[0][4], out[1][4]
-    assert [int(x[5].rank) for x in out] == [2, 2] and all(x[5].redundant for x in out)
-    close(y2[:3], y1[:3], 1e-13)
-    close(s2[:3], s1[:3], 1e-13)
-    for a, b in ((y1, y2), (s1, s2)):
-        close(b[3:8], a[3:] / 2, 1e-13)
-        close(b[8:], a[3:] / 2, 1e-13)
-    for full, along, w, chain, (_, slope, g, turned), _ in out:
-        value = lambda *x, chain=chain: BOTH(chain, *x)[0]
-        close(slope, differences(lambda x, value=value: value(*x), full, along, 1e-4), 1e-9)
-        close(sum((a * b).sum() for a, b in zip(g, along, strict=True)), w @ slope, 1e-12)
+        x = (*sdyn.pad(chain, q, v), np.r_[np.zeros(6), tau], mass)
+        y, status = BOTH(chain, method, *x)
+        slopes = derivatives(chain, method, w, x, (*along, 0.3 * mass), order)
+        assert status.rank == 2 and status.redundant
+        out.append((y[6:], slopes[0][6:]))
+        value = lambda x, chain=chain: BOTH(chain, method, *x)[0]
+        close(slopes[0], differences(value, x, (*along, 0.3 * mass), 1e-4), 1e-9)
+        close(sum((a * b).sum() for a, b in zip(slopes[1], (*along, 0.3 * mass), strict=True)), w @ slopes[0], 1e-12)
         if order == 2:
-            gradient = lambda x, a=(chain, w), b=along: np.concatenate(derivatives(*a, x, b, 1)[2])
-            close(np.concatenate(turned), differences(gradient, full, along, 1e-4), 1e-8)
+            gradient = lambda x, a=(chain, method, w), b=along, m=mass: np.concatenate(
+                derivatives(*a, x, (*b, 0.3 * m), 1)[1]
+            )
+            close(np.concatenate(slopes[2]), differences(gradient, x, (*along, 0.3 * mass), 1e-4), 1e-8)
+    for once, twice in zip(*out, strict=True):
+        close(twice[:3], once[:3], 1e-13)
+        close(twice[3:8], once[3:8] / 2, 1e-13)
+        close(twice[8:], once[3:8] / 2, 1e-13)
+
+
+def test_derivatives_where_the_redundancy_turns():
+    """Of accelerations and multipliers of the Bricard mechanism along its motion."""
+    data, chain, still = np.load(oracles.DATA / "bricard_square.npz"), sdyn.pack(bricard()), np.zeros(5)
+    a, b = (data[k][np.array([100, 101])] for k in "ab")
+    start, then = np.stack([a, b, -a, -b, -a], 1)
+    rate = then - start
+
+    def along(t):
+        q, v = sdyn.project(chain, start + t * rate, rate)
+        return jnp.concatenate(sdyn.constrained_dynamics(chain, q, v, still, gravity=GRAVITY)[:2])
+
+    run = jax.jit(lambda t: (along(t), jax.jacfwd(along)(t)), **QUICKLY)
+    close(run(0.0)[1], differences(lambda t: run(t[0])[0], (0.0,), (1.0,), 1e-3), 1e-8)
+
+
+def hinged(rng):
+    """A free base with a moving spherical joint and a locked one, held by a universal closure and by the ground."""
+    loose = tree_and_loop("universal", rng)[1].open("tie")
+    q = np.r_[0.5 * rng.normal(size=3), unit(rng, 4), rng.uniform(-0.5, 0.5, 5), unit(rng, 4)]
+    mine = loose.close("hand", sdyn.Frame("tool", "tool"), "universal", q=q, name="tie")
+    mine = mine.close("grip", "ground", "point", q=q, name="foot").lock({"arm0": q[7]})
+    return sdyn.pack(mine), np.delete(q, 7)
+
+
+def test_gradient_of_a_closed_chain(rng):
+    """With respect to state, forces, gravity, wrenches, masses, joints and closures, against differences; each has a
+    direction of its own."""
+    chain, q = hinged(rng)
+    w, nv = rng.normal(size=chain.nv + chain.capacity.rows), chain.nv
+    own = chain.link_mass, chain.joint_value, chain.loop_value
+    x = (q, rng.normal(size=nv), rng.normal(size=nv), GRAVITY, rng.normal(size=(chain.capacity.links, 6)), *own)
+    along = [rng.normal(size=np.shape(y)) for y in x]
+    along[6] = 0.1 * along_joints(np.asarray(x[6]), along[6])
+
+    def value(q, v, tau, gravity, f_ext, mass, joints, loops):
+        new = sdyn.with_params(
+            replace(chain, joint_value=joints, loop_value=loops), replace(sdyn.params(chain), mass=mass)
+        )
+        out = sdyn.constrained_dynamics(new, q, v, tau, gravity=gravity, f_ext=f_ext)
+        return w @ jnp.concatenate(out[:2])
+
+    run = jax.jit(value, **QUICKLY)
+    g = jax.jit(jax.grad(value, range(8)), **QUICKLY)(*x)
+    found = [(np.asarray(a) * b).sum() for a, b in zip(g, along, strict=True)]
+    for k in range(8):
+        only = tuple(y if i == k else 0 * y for i, y in enumerate(along))
+        close(found[k], differences(lambda y: run(*y), x, only, 1e-4), 1e-8, scale=found)
 
 
 @partial(jax.jit, **QUICKLY)

@@ -1,15 +1,12 @@
-"""Changes of structure with closures: momentum, energy, restitution, and gradients through a capture."""
+"""Changes of structure with closures: momentum, energy, restitution."""
 
 from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
-import mechanisms
 import numpy as np
 import pytest
 from structures import QUICKLY, UNBALANCED, close, states, tree
-from test_gradients import differences
 
 import sdyn
 
@@ -99,52 +96,3 @@ def test_restitution(start):
     if change == "close another":
         old = np.arange(SIZE.rows) < 5
         close((K @ out[1.0][2])[old], np.zeros(5), 1e-11, scale=v)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("grounded", [False, True])
-def test_gradient_of_a_capture(grounded, rng):
-    """One second of two arms: approach, capture of the target by the second hand, closed, release.
-
-    With respect to the initial state, the torques, the target's inertia and the times of capture and release.
-    """
-    free = mechanisms.two_arms()
-    mine = free.reroot("l_base").ground("l_base") if grounded else free
-    both = [free, free.close("r_hand", "handle", name="grip"), free.ground(free.base)]
-    size = sdyn.capacity([*both, both[1].ground(free.base)])
-    family = [sdyn.pack(x, size) for x in (mine, mine.close("r_hand", "handle", name="grip"))]
-    family = jax.tree.map(lambda *x: jnp.stack(x), *family)
-    joints = rng.uniform(-1, 1, 14)
-    base = [] if grounded else [0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5]
-    q, v = sdyn.pad(sdyn.pack(mine, size), np.r_[base, joints], 0.1 * rng.normal(size=mine.nv))
-    target = size.link_names.index(free.links[-1].name)
-    taus = 0.5 * rng.normal(size=(3, 20, 20)) * (np.arange(20) >= 6)
-    x = q, v, taus, np.array([0.35, 0.4, 0.25]), np.asarray(family.link_inertia[0, target])
-    assert mine.nv == (14 if grounded else 20)
-    w = rng.normal(size=(2, 20))
-    run = capture_slope()
-    along = [rng.normal(size=np.shape(y)) for y in x]
-    along[1] = along[1] * (np.arange(20) >= (6 if grounded else 0))
-    along[2], along[3] = along[2] * (np.arange(20) >= 6), 0.1 * along[3]
-    along[4] = 0.05 * np.trace(x[4]) * (along[4] + along[4].T)
-    if grounded:
-        along[0] = along[0] * (np.arange(21) >= 7)
-    _, g = run(family, target, w, x)
-    for k, name in enumerate(("q", "v", "torques", "times", "inertia")):
-        only = tuple(d if i == k else np.zeros_like(d) for i, d in enumerate(along))
-        want = differences(lambda x: run(family, target, w, x)[0], x, only, 1e-4)
-        close((np.asarray(g[k]) * along[k]).sum(), want, 1e-6, scale=1.0), name
-    assert run._cache_size() == 1
-
-
-def capture_slope(found=[]):  # noqa: B006  (compiled once)
-    def value(family, target, w, x):
-        q, v, taus, durations, inertia = x
-        new = family.link_inertia.at[:, target].set(inertia)
-        family = jax.vmap(lambda chain, I: sdyn.with_params(chain, replace(sdyn.params(chain), inertia=I)))(family, new)
-        out = sdyn.hybrid_rollout(family, q, v, taus, durations, jnp.array([0, 1, 0]))
-        return w[0, :14] @ out.q[-1, -1, 7:21] + w[1] @ out.v[-1, -1] + (jnp.sin(out.impulse[1])).sum() * 0.1
-
-    if not found:
-        found.append(jax.jit(jax.value_and_grad(value, 3), **QUICKLY))
-    return found[0]

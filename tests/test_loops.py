@@ -39,7 +39,8 @@ def loop_capacity() -> sdyn.Capacity:
 
 def constrained(chain, q, v, tau, gravity):
     out = sdyn.constrained_dynamics(chain, q, v, tau, gravity=gravity)
-    return *out, sdyn.loop_jacobian(chain, q), sdyn.loop_residual(chain, q), sdyn.body_poses(chain, q)[0]
+    by_partition = sdyn.constrained_dynamics(chain, q, v, tau, gravity=gravity, method="partition")[:2]
+    return *out, by_partition, sdyn.loop_jacobian(chain, q), sdyn.loop_residual(chain, q), sdyn.body_poses(chain, q)[0]
 
 
 CONSTRAINED = jax.jit(jax.vmap(constrained, (None, 0, 0, 0, None)), **QUICKLY)
@@ -47,21 +48,23 @@ CONSTRAINED = jax.jit(jax.vmap(constrained, (None, 0, 0, 0, None)), **QUICKLY)
 
 @pytest.mark.parametrize(("name", "loop"), LOOPS)
 def test_loops_of_trees(name, loop):
-    """Accelerations and multipliers; a free base has no part in a closure between two links."""
+    """Accelerations and multipliers by both methods; a free base has no part in a closure between two links."""
     mine, info = closed(name, loop)
     chain, data = sdyn.pack(mine, loop_capacity()), oracles.tree(f"{name}_loop_{loop}")
     q, v = sdyn.pad(chain, data["q"], data["nu"])
     _, tau = sdyn.pad(chain, data["q"], data["tau"])
-    vdot, lam, status, K, residual, R = CONSTRAINED(chain, q, v, tau, data["gravity"])
-    close(sdyn.unpad(chain, q, vdot)[1], data["nudot"], 6e-14)  # 7.5e-15
+    vdot, lam, status, (vdot2, lam2), K, residual, R = CONSTRAINED(chain, q, v, tau, data["gravity"])
+    for found in (vdot, vdot2):
+        close(sdyn.unpad(chain, q, found)[1], data["nudot"], 6e-14)  # 7.5e-15
     at, want = 0, []
     for x in info:  # theirs is [force; torque] on link a, world axes
         turn = np.asarray(R)[:, chain.capacity.link_names.index(f"l{x['link_a']}")] @ np.array(x["frame_a"]["R"])
         theirs = data["lam"][:, at : at + (6 if x["type"] == "6D" else 3)]
         want += [np.einsum("sji,sj->si", turn, y) for y in (theirs[:, 3:], theirs[:, :3]) if y.size]
         at += theirs.shape[1]
-    close(lam[:, :at], np.concatenate(want, 1), 2e-13)  # 2.4e-14
-    assert not np.asarray(lam)[:, at:].any()
+    for found in (lam, lam2):
+        close(found[:, :at], np.concatenate(want, 1), 2e-13)  # 2.4e-14
+        assert not np.asarray(found)[:, at:].any()
     assert not np.asarray(K)[:, :, :6].any()
     close(residual, 0 * residual, 1e-14, scale=1.0)  # 1.3e-15
     assert (status.rank == at).all() and not np.asarray(status.singular).any()
@@ -72,12 +75,14 @@ def test_loops_of_trees(name, loop):
 
 
 @cache
-def grapples(name):
-    """A free tree, its tip tied to the ground by a closure, and the same with the tip as a grounded base."""
-    mine, tip = robot(name), f"l{int(oracles.raw(f'{name}_grapple')['tip_link'])}"
-    variants = mine, mine.close(sdyn.Frame("tip", tip), "ground", name="grip"), mine.reroot(tip).ground(tip)
-    size = sdyn.capacity(variants)
-    return tip, [sdyn.pack(x, size) for x in variants]
+def grapples() -> dict:
+    """Of each tree: its tip; free, its tip tied to the ground by a closure, and with the tip as a grounded base."""
+    out = {}
+    for name in oracles.TREES:
+        mine, tip = robot(name), f"l{int(oracles.raw(f'{name}_grapple')['tip_link'])}"
+        out[name] = tip, [mine, mine.close(sdyn.Frame("tip", tip), "ground", name="grip"), mine.reroot(tip).ground(tip)]
+    size = sdyn.capacity([x for _, variants in out.values() for x in variants])
+    return {name: (tip, [sdyn.pack(x, size) for x in variants]) for name, (tip, variants) in out.items()}
 
 
 def grapple(before, after, q, v, tau, gravity):
@@ -94,15 +99,16 @@ GRAPPLE = jax.jit(jax.vmap(grapple, (None, None, 0, 0, 0, None)), **QUICKLY)
 @pytest.mark.parametrize("name", oracles.TREES)
 def test_grapples(name):
     """The plastic jump, its impulse, and the accelerations after it: as a closure to ground, and as a grounded base."""
-    tip, (free, tied, fixed) = grapples(name)
+    tip, (free, tied, fixed) = grapples()[name]
     data, world = oracles.tree(f"{name}_grapple"), oracles.raw(f"{name}_grapple")
     q, v = sdyn.pad(free, data["q"], data["nu_before"])
     tau = sdyn.pad(free, data["q"], data["tau"])[1]
     *_, totals = GRAPPLE(free, free, q, v, tau, data["gravity"])
-    _, _, v1, impulse, vdot, lam, status, (R, p), after = GRAPPLE(free, tied, q, v, tau, data["gravity"])
-    n, k, nv = free.capacity.links, free.capacity.link_names.index(tip), 6 + free.capacity.nv
-    close(v1, data["nu_after"], 1e-13)  # 1.1e-14
-    close(vdot, data["nudot"], 2e-13)  # 2.3e-14
+    _, q1, v1, impulse, vdot, lam, status, (R, p), after = GRAPPLE(free, tied, q, v, tau, data["gravity"])
+    n, k, nv = free.capacity.links, free.capacity.link_names.index(tip), data["nu_after"].shape[-1]
+    exact = lambda y: sdyn.unpad(tied, q1, y)[1]
+    close(exact(v1), data["nu_after"], 1e-13)  # 1.1e-14
+    close(exact(vdot), data["nudot"], 2e-13)  # 2.3e-14
     turn = lambda x: np.einsum("sij,sj->si", R[:, k], x)
     close(turn(lam[:, 3:]), world["lam"][:, :3], 1e-13, scale=world["lam"])  # 8.1e-15
     close(turn(lam[:, :3]), world["lam"][:, 3:], 1e-13, scale=world["lam"])
@@ -116,9 +122,22 @@ def test_grapples(name):
     arm = np.asarray(p)[:, k] - np.asarray(c)
     close(h1 - h0, np.concatenate([at_tip[:, :3] + np.cross(arm, at_tip[:, 3:]), at_tip[:, 3:]], 1), 2e-14)  # 1.8e-15
     assert (T1 < T0).all()
-    only_joints = np.asarray(tau) * (np.arange(nv) >= 6)
+    only_joints = np.asarray(tau) * (np.arange(tau.shape[-1]) >= 6)
     _, _, v2, by_ground, a, *_ = GRAPPLE(free, fixed, q, v, only_joints, data["gravity"])
     close(np.asarray(by_ground)[:, k], at_tip, 2e-13)  # 1.3e-14
-    close(v2[:, 6:], v1[:, 6:], 2e-13)  # 2.4e-14
+    close(v2[:, 6:nv], v1[:, 6:nv], 2e-13)  # 2.4e-14
     b = GRAPPLE(free, tied, q, v, only_joints, data["gravity"])[4]
-    close(np.asarray(a)[:, 6:], np.asarray(b)[:, 6:], 1e-12)
+    close(np.asarray(a)[:, 6:nv], np.asarray(b)[:, 6:nv], 1e-12)
+
+
+def test_float32():
+    """A closed tree in float32: as near as that allows, and nothing is promoted."""
+    mine, data = closed("tree17", "6D_3D")[0], oracles.tree("tree17_loop_6D_3D")
+    chain = sdyn.pack(mine, loop_capacity(), dtype="float32")
+    q, v = sdyn.pad(chain, data["q"], data["nu"])
+    single = [np.asarray(x, np.float32) for x in (q, v, sdyn.pad(chain, data["q"], data["tau"])[1], data["gravity"])]
+    vdot, lam, status, *_ = CONSTRAINED(chain, *single)
+    want = CONSTRAINED(sdyn.pack(mine, loop_capacity()), *(np.asarray(x, float) for x in single))
+    assert vdot.dtype == lam.dtype == np.float32 and (status.rank == 9).all()
+    close(vdot, want[0], 1e-4)
+    close(lam, want[1], 1e-4)

@@ -58,21 +58,26 @@ RUN = jax.jit(jax.value_and_grad(end, 2, has_aux=True), **QUICKLY)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["free"])
-def test_gradients_of_a_capture_and_release(case, rng):
-    """With respect to the initial state, torques, target inertia and capture time, against differences; momentum,
-    energy and closure on the way; the other case is the same program."""
+@pytest.mark.parametrize("case", ORDERS)
+def test_gradients_of_a_capture_and_release(case):
+    """With respect to the initial state, torques, target inertia and capture time, against differences; energy, closure
+    and momentum on the way; both cases are one program.
+
+    The motion keeps away from singular configurations, where differences, not the gradients, are off.
+    """
+    rng = np.random.default_rng(0)
     family, members = sdyn.family(VARIANTS), ORDERS[case]
     q, v = start(rng)
-    x = sdyn.pad(jax.tree.map(lambda y: y[0], family), q, v)
+    x = sdyn.pad(jax.tree.map(lambda y: y[members[0]], family), *((q, v) if case == "free" else (q[7:], v[6:])))
     moves = np.arange(20) >= 6
     x = (*x, rng.normal(size=(4, STEPS, 20)) * TORQUES, ROBOT.link("target").inertia, np.array(0.0))
     (_, out), slope = RUN(family, members, x)
-    _check_motion(out)
+    _check_motion(out, free=case == "free")
     turn = rng.normal(size=(3, 3))
+    moving = np.ones(7) if case == "free" else np.zeros(7)
     along = [
-        np.r_[0.1 * rng.normal(size=7), rng.normal(size=14)],
-        rng.normal(size=20),
+        np.r_[0.1 * rng.normal(size=7) * moving, rng.normal(size=14)],
+        rng.normal(size=20) * np.r_[moving[:6], np.ones(14)],
         rng.normal(size=x[2].shape) * moves,
         turn + turn.T,
         np.array(0.05),
@@ -80,23 +85,23 @@ def test_gradients_of_a_capture_and_release(case, rng):
     for k, direction in enumerate(along):
         only = tuple(direction if i == k else np.zeros_like(y) for i, y in enumerate(x))
         want = differences(lambda y: RUN(family, members, y)[0][0], x, only, 3e-4)
-        close((np.asarray(slope[k]) * direction).sum(), want, 1e-6)  # 1.4e-7
-    grounded = sdyn.pad(jax.tree.map(lambda y: y[2], family), q[7:], v[6:])
-    slope = RUN(family, ORDERS["one arm grounded"], (*grounded, *x[2:]))[1]
-    assert all(np.isfinite(y).all() for y in slope) and RUN._cache_size() == 1
+        close((np.asarray(slope[k]) * direction).sum(), want, 1e-6)  # 3.7e-7 for the inertia, 3.6e-9 for the others
+    assert RUN._cache_size() == 1
 
 
-def _check_motion(out):
-    """Closed while it should be; the jump loses energy; the momentum stays."""
+def _check_motion(out, free):
+    """Closed while it should be; the jump loses energy; the momentum of a free robot stays."""
     one = lambda k: jax.tree.map(lambda y: y[k], out.chain)
     for k in (1, 2):
         residual = jax.vmap(partial(sdyn.loop_residual, one(k)))(out.q[k])
-        assert np.abs(residual).max() < 1e-12  # 3e-14
+        assert np.abs(residual).max() < 1e-12  # 1e-15
         K = jax.vmap(partial(sdyn.loop_jacobian, one(k)))(out.q[k])
         assert np.abs(np.einsum("sij,sj->si", K, out.v[k])).max() < 1e-9  # 8e-11
     before = sdyn.kinetic_energy(one(0), out.q[0, -1], out.v[0, -1])
     after = sdyn.kinetic_energy(one(1), out.q[1, 0], out.v[1, 0])
     assert after < before * (1 - 1e-3)
     close(out.v[3, 0], out.v[2, -1], 1e-13)  # a release does not jump
+    if not free:
+        return
     h = jax.vmap(lambda c, q, v: jax.vmap(partial(sdyn.momentum, c))(q, v))(out.chain, out.q, out.v)
     close(h, np.broadcast_to(h[0, 0], h.shape), 1e-6)  # 1.6e-7, of the steps
