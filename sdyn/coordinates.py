@@ -130,8 +130,9 @@ def retract(chain: Chain, q, xi):
     else:
         out = q.at[jnp.where(chain.dof_to_q >= 0, nb + chain.dof_to_q, q.shape[0])].add(joints, mode="drop")
         places = nb + chain.quat_index[0][:, None] + jnp.arange(4)
-        real, quat = _quat_is_real(chain)[:, None], q[places]
-        new = jnp.where(real, _turned(quat.T, joints[_quat_dofs(chain)].T).T, quat)
+        real = _quat_is_real(chain)[:, None]
+        quat = jnp.where(real, q[places], jnp.array([1, 0, 0, 0], q.dtype))  # what is no quaternion may have no length
+        new = _turned(quat.T, joints[_quat_dofs(chain)].T).T
         out = out.at[jnp.where(real, places, q.shape[0])].set(new, mode="drop")
     if nb:
         base = jnp.concatenate([q[:3] + xi[3:6], _turned(q[3:7], xi[:3])])

@@ -14,6 +14,7 @@ import pytest
 from structures import QUICKLY, body, quaternions, rotation, unit, with_frames, without_mass
 
 import sdyn
+from sdyn.coordinates import retract
 from sdyn.parts import KINDS
 
 ROBOTS, STATES = 24, 6
@@ -136,7 +137,7 @@ ELSEWHERE = {  # and where
     "params", "with_params", "with_locks",  # below, in every function
     "partition",  # picks rows, no numbers; its solver is `constrained_dynamics`, test_closures.py
     "forward_dynamics_jacobians",  # test_jacobians.py
-    "hybrid_rollout", "growth",  # rollouts
+    "hybrid_rollout", "growth", "choose",  # rollouts
     "pad", "unpad", "pack", "capacity", "family", "load", "save", "reduce",  # host stage
 }  # fmt: skip
 CLOSED = {"project", "integrate"}  # of states that are closed, or almost
@@ -148,6 +149,14 @@ SINGULAR = {  # where the gradient has no meaning: its value alone is searched
 def test_every_public_function_is_searched():
     functions = {name for name, x in vars(sdyn).items() if callable(x) and not isinstance(x, type) and name[0] != "_"}
     assert functions == FUNCTIONS.keys() | ELSEWHERE
+
+
+def test_retraction_where_quaternions_are_empty():
+    """Found by the search: an empty quaternion read zeros at q = 0, and its length spoilt the slope of every step."""
+    slopes = jax.jit(jax.jacrev(retract, (1, 2)), **QUICKLY)
+    for robot in found():
+        chain, q, v = states(robot)
+        assert all(np.isfinite(x).all() for at in range(STATES) for x in slopes(chain, q[at], 0.1 * v[at]))
 
 
 @pytest.mark.slow
