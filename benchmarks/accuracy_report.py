@@ -30,7 +30,9 @@ def show(result):
     console = Console(highlight=False, width=min(Console().width, 100))
     say = lambda text: console.print(Text(text), soft_wrap=not console.is_terminal)
     versions = ", ".join(f"{name} {version}" for name, version in result["versions"].items() if version)
-    say(f"{result['cpu']}, one thread on one core of {result['cores']}, load {result['load']}; {versions}")
+    say(f"{result['cpu']}, one thread, {result['cores']} cores, load {result['load']}; {versions}")
+    if "not_run" in result:
+        say(f"not run {result['not_run']}")
     console.print(_cheapest(result))
     console.print(_chosen(result))
     table = Table(title="What to choose when", show_header=False, **LOOK)
@@ -87,11 +89,13 @@ def chart(result, path):
         best = [point for point in scene["points"] if point["pareto"]]
         x, y = ([max(point[key], 1e-16) for point in best] for key in ("seconds", "error"))
         (lines["nothing is better"],) = axes.plot(x, y, "o", mfc="none", mec="black", ms=8, mew=0.9)
-        for label, contender, value in PRESETS:
+        for label, contender, value, side in PRESETS:
             for point in scene["points"]:
                 if point["contender"] == contender and point["x"] == value:
                     at = (point["seconds"], max(point["error"], 1e-16))
-                    axes.annotate(label, at, (-6, -11), textcoords="offset points", ha="right", fontsize=7)
+                    place = dict(textcoords="offset points", ha="right" if side < 0 else "left", va="center")
+                    axes.annotate(label, at, (7 * side, 3 * side), fontsize=7, **place)
+        axes.margins(x=0.12)
         axes.set(xscale="log", yscale="log", title=f"{name}, {scene['dt'] * scene['steps']:.3g} s")
         axes.grid(alpha=0.25)
     for axes in panels.flat[count:]:
@@ -107,7 +111,12 @@ def chart(result, path):
     plt.close(figure)
 
 
-PRESETS = ("fast", "RK4, float32", 1), ("balanced", "RK4", 1), ("accurate", "RK4", 8), ("reference", "adaptive", 1e-13)
+PRESETS = (  # label, contender, its number of substeps or tolerance, side of the point
+    ("fast", "RK4, float32", 1, 1),
+    ("balanced", "RK4", 1, -1),
+    ("accurate", "RK4", 8, -1),
+    ("reference", "adaptive", 1e-13, 1),
+)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""The kept results of benchmarks: the README says what they say, and the table fits a terminal."""
+"""The kept results of benchmarks: the README says what they say, and the tables fit a terminal."""
 
 import json
 import re
 import sys
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -44,3 +46,45 @@ def test_the_readme_says_what_was_measured():
     short = lambda x: f"{x:.1f}" if x >= 1 else f"{x:.2f}"
     measured = {(row["what"], row["slow"]): short(row["ratio"]) for row in KEPT["ratios"]}
     assert {row[:2]: row[2] for row in rows} == {key: measured[key] for key in [row[:2] for row in rows]}
+
+
+# -- accuracy ----------------------------------------------------------------------------------------------------------
+
+ACCURACY = json.loads((ROOT / "benchmarks" / "results" / "accuracy.json").read_text())
+
+
+def points(scene, contender, error=float("inf")):
+    return [x for x in ACCURACY["scenes"][scene]["points"] if x["contender"] == contender and x["error"] <= error]
+
+
+def test_the_tables_of_accuracy_fit_80_columns(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import accuracy_report
+
+    accuracy_report.show(ACCURACY)
+    lines = capsys.readouterr().out.split("Cheapest way")[1].splitlines()
+    assert max(map(len, lines)) <= 80 and not any("…" in line for line in lines)
+    for name in ("accuracy_report", "harness"):
+        del sys.modules[name]
+
+
+def test_the_chart_says_what_is_claimed():
+    """Of the kept run: the reference on Andrews, orders along the ladders, a wanted error met at a fair price."""
+    assert ACCURACY["chosen"]["Andrews"]["errors"]["reference"] <= 1e-11
+    orders = {"RK4": 4, "semi-implicit": 1, "variational": 2, "implicit": 4}
+    for contender, order in orders.items():
+        ladder = [x for x in points("free flyer, 13 DOF", contender, 1e-2) if x["error"] > 1e-10]
+        steepest = max(np.log2(a["error"] / b["error"]) for a, b in pairwise(ladder))
+        assert abs(steepest - order) < 0.2, (contender, steepest)
+    assert len(ACCURACY["chosen"]) == 5
+    for scene, x in ACCURACY["chosen"].items():
+        assert x["error"] <= 1e-6 and x["ratio"] <= 1.5, (scene, x)
+
+
+def test_points_on_the_front_are_marked():
+    for scene in ACCURACY["scenes"].values():
+        for a in scene["points"]:
+            beaten = any(b["error"] < a["error"] and b["seconds"] < a["seconds"] for b in scene["points"])
+            assert not (beaten and a["pareto"])
+        assert sum(a["pareto"] for a in scene["points"]) >= 3
