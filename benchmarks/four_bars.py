@@ -3,7 +3,7 @@
     python benchmarks/four_bars.py [N ...]
 
 The largest relative error of the energy, whether the parallelogram stays one, how far from the pendulum of the closed
-form, and the least singular value that the status reports on the way; results/four_bars.json. N = 40 takes minutes.
+form, and the least singular value that the status reports on the way; results/four_bars.json. N = 40 takes long.
 """
 
 import sys
@@ -73,7 +73,7 @@ def main():
     for count in map(int, sys.argv[1:] or COUNTS):
         results.append(run(count))
         print(results[-1], flush=True)
-    harness.save("four_bars", dict(machine=harness.machine(), steps=STEPS, dt=DT, results=results))
+        harness.save("four_bars", dict(machine=harness.machine(), steps=STEPS, dt=DT, results=results))
 
 
 if __name__ == "__main__":
