@@ -17,7 +17,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 # What takes longest comes first, so that two workers end together; files stay whole, their tests share programs.
-LONGEST = ("test_grasp.py", "test_gradients.py", "test_transfer.py", "test_laws.py", "test_floating_motion.py")
+LONGEST = (
+    "test_grasp.py", "test_notebooks.py", "test_grasp_planar.py", "test_gradients.py", "test_mechanisms.py",
+    "test_closures.py", "test_integrate.py", "test_transfer.py", "test_laws.py", "test_floating.py", "test_hybrid.py",
+)  # fmt: skip
 
 
 def pytest_xdist_auto_num_workers(config):

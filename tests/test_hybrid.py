@@ -84,7 +84,8 @@ def test_saltation(line):
 
     before, after = chosen(line, 0), chosen(line, 1)
     q, v = out.q[0, -1], out.v[0, -1]
-    jump = jax.jit(lambda q, v, *along: jax.jvp(lambda q, v: sdyn.transfer(before, after, q, v)[1:3], (q, v), along))
+    go = lambda q, v: sdyn.transfer(before, after, q, v)[1:3]
+    jump = jax.jit(lambda q, v, *along: jax.jvp(go, (q, v), along), **QUICKLY)
     plus, (dq, dv) = jump(q, v, *rate(before, q, v, PUSH))
     fq, fv = rate(chosen(out.chain, 1), *plus, PUSH)
     want = (dq - fq)[0] + TIMES[1] * (dv - fv)[3]  # behind the switch, the base goes straight on

@@ -89,6 +89,7 @@ def test_order_on_a_tree(method):
     assert abs(np.log2(errors[0] / errors[1]) - METHODS[method]) < 0.2, errors  # 1.00, 4.00, 2.00, 4.00
 
 
+@pytest.mark.slow  # to compile
 @pytest.mark.parametrize("method", EQUATIONS)
 def test_order_on_a_closed_chain(method):
     """Within 0.2 of nominal, on the four-bar in 30 digits, which stays closed."""

@@ -10,7 +10,7 @@ import numpy as np
 import oracles
 import pytest
 from scipy.integrate import solve_ivp
-from structures import close
+from structures import QUICKLY, close
 
 import sdyn
 
@@ -37,7 +37,7 @@ def test_states_of_a_four_bar(method):
     for kind, first in (("point", 0), ("revolute", 2)):
         chain = sdyn.pack(mechanisms.four_bar(kind))
         solve = lambda q, v, tau, chain=chain: sdyn.constrained_dynamics(chain, q, v, tau, gravity=DOWN, method=method)
-        vdot, lam, status = jax.jit(jax.vmap(solve))(q, v, tau)
+        vdot, lam, status = jax.jit(jax.vmap(solve), **QUICKLY)(q, v, tau)
         close(vdot, want, 1e-14)  # 7.5e-16
         turn = (q[:, 0] + q[:, 1])[:, None]  # frame a turns with the coupler
         c, s, (x, y) = np.cos(turn), np.sin(turn), (np.asarray(lam)[:, [first + k]] for k in (0, 1))
@@ -63,7 +63,8 @@ def test_bricard():
     """Ten seconds of a chain whose closure has five rows of rank four: energy to 1e-9 J, points to 1e-7 m."""
     data = np.load(oracles.DATA / "bricard_square.npz")
     chain = sdyn.pack(mechanisms.bricard())
-    _, _, status = jax.jit(sdyn.constrained_dynamics)(chain, np.zeros(5), np.zeros(5), np.zeros(5), gravity=DOWN)
+    still = np.zeros(5)
+    _, _, status = jax.jit(sdyn.constrained_dynamics, **QUICKLY)(chain, still, still, still, gravity=DOWN)
     assert status.rank == 4 and status.redundant and not status.singular
     q, _, energy, residual = roll(chain, np.zeros(5), np.zeros(5), 0.0025, 4000)
     assert np.abs(energy - energy[0]).max() < 1e-9 and residual < 1e-14  # 6.4e-11, 6.9e-16
@@ -80,7 +81,7 @@ def test_andrews():
     q, v, want = (np.stack([data[x + end][rows] for x in names], 1) for end in ("", "_dot", "_ddot"))
     for method in ("proximal", "partition"):
         solve = lambda q, v, method=method: sdyn.constrained_dynamics(chain, q, v, force(0, q, v), method=method)
-        vdot, _, status = jax.jit(jax.vmap(solve))(q, v)
+        vdot, _, status = jax.jit(jax.vmap(solve), **QUICKLY)(q, v)
         close(vdot, want, 2e-14)  # 2.1e-15
         assert (status.rank == 6).all()
     start = np.array([data[x][0] for x in names])
@@ -108,5 +109,5 @@ def test_row_of_four_bars(count):
     want = solve_ivp(slope, (0, t[-1]), q[:1].tolist() + v[:1].tolist(), "DOP853", t, rtol=1e-12, atol=1e-12).y[0]
     close(angle[:, 0], want, 1e-7)  # 8e-8 of 30 rad is 3e-9
     nearest = int(np.argmin(np.abs(np.sin(angle[:, 0]))))
-    sigma = jax.jit(lambda q: sdyn.constrained_dynamics(chain, q, 0 * v, 0 * v)[2].sigma_min)
+    sigma = jax.jit(lambda q: sdyn.constrained_dynamics(chain, q, 0 * v, 0 * v)[2].sigma_min, **QUICKLY)
     assert sigma(qs[nearest]) < 1e-2 * sigma(qs[0])  # the status says where

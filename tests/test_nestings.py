@@ -65,7 +65,7 @@ GROUPS = (kinematics, dynamics, linearised, totals, floating, motion, held)
 ELSEWHERE = {
     "params", "with_params", "with_locks",  # test_params, test_gradients
     "transfer", "hybrid_rollout",  # test_transfer, test_hybrid: of two structures, and of many
-    "partition", "conditioning", "diagnose", "growth", "reduce",  # numbers that nobody differentiates
+    "partition", "conditioning", "diagnose", "growth", "choose", "reduce",  # numbers that nobody differentiates
     "capacity", "family", "pack", "pad", "unpad", "load", "save",  # before the device
 }  # fmt: skip
 
