@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom and prints what is kept in it, numbers of rounding size aside."""
 
+import os
 import pathlib
 import re
 
@@ -7,6 +8,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+QUICKLY = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"}  # to compile
 NOTEBOOKS = sorted((pathlib.Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
@@ -21,5 +23,5 @@ def printed(notebook):
 def test_notebook_runs_and_prints_what_it_shows(path):
     kept = nbformat.read(path, as_version=4)
     fresh = nbformat.read(path, as_version=4)
-    NotebookClient(fresh, timeout=300, kernel_name="python3").execute()
+    NotebookClient(fresh, timeout=300, kernel_name="python3").execute(env=os.environ | QUICKLY)
     assert printed(fresh) == printed(kept)
