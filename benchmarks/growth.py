@@ -141,9 +141,8 @@ def by_frame(batch=64):
         return np.asarray(jax.jit(contenders.batched(sdyn.forward_dynamics))(chain, *x), float)
 
     out = {}
-    for name, robot in {"37 DOF": subjects.compared()["paper37"]} | {
-        f"chain of {n}": subjects.chain(n) for n in (31, 316)
-    }.items():
+    robots = {"37 DOF": subjects.compared()["paper37"]} | {f"chain of {n}": subjects.chain(n) for n in (31, 316)}
+    for name, robot in robots.items():
         how = [(frame, dtype) for dtype in ("float64", "float32") for frame in ("link", "common")]
         run = {" ".join(x): contenders.forward(robot, batch, frame=x[0], dtype=x[1]) for x in how}
         out[name], exact = measured(run), accelerations(robot, "link", "float64")
@@ -255,11 +254,11 @@ def main():
     """Measure, save, show."""
     harness.one_thread()
     result = dict(what="time per sample of forward dynamics, one thread on one core", **harness.machine())
-    for f in (by_joints, by_batch, by_shape, by_padding, by_block, by_sharing, by_frame):
+    for f in (by_padding, by_frame, by_sharing, by_joints, by_batch, by_block, by_shape):
         key = f.__name__.removeprefix("by_")
         print(f"by {key}", flush=True)
         result[key] = f()
-    harness.save("growth", result)
+        harness.save("growth", result)
     show(result)
     chart(result, harness.RESULTS / "growth.png")
 
