@@ -88,8 +88,8 @@ def _composites(motion: Motion):
 
     base = coriolis(inertia_of_base(walk, bodies), motion.V[walk.slots], motion.IV[walk.slots])
     C = walk.zeros(36, B, dtype).at[walk.slots].set(base.reshape(36, *B))
-    wide = jnp.broadcast_to(bodies.m, (walk.slots + 2, 1, *B))
-    stored = wide, bodies.h, bodies.Io, motion.f, C, *(walk.empty(6, B, dtype) for _ in range(7))
+    wide = (jnp.broadcast_to(y, (*y.shape[:2], *B)) for y in (bodies.m, bodies.h, bodies.Io))  # samples may share them
+    stored = *wide, motion.f, C, *(walk.empty(6, B, dtype) for _ in range(7))
     m, h, Io, _, C, *kept = walk.inward(inward, stored)
     IC0 = widened(inertia_of_base(walk, Bodies(bodies.S, Io, h, m)))
     return [walk.cleared(y)[: walk.slots] for y in kept], IC0, C[walk.slots].reshape(6, 6, *B)

@@ -2,7 +2,7 @@
 
 All quantities are in the base's own frame (the ground's, seen from the base, when it is grounded): inertias add up
 without transforms and nothing depends on the pose of the base. The values, not the derivatives, of dynamics exist in
-the links' own frames too: slower, and more exact far from the base. Arrays are `(components, W, *B)` inside a step and
+the links' own frames too, slower and more exact far from the base. Arrays are `(components, W, *B)` inside a step and
 `(slots + 2, components, *B)` between steps; the last two slots are the base and a dummy. B is the batch: one axis, or
 two where many columns share a sample.
 
