@@ -29,15 +29,15 @@ OPERANDS = (
 FLOATS = OPERANDS[3:]
 
 
-def closures(*operands, work, axes=1):
+def closures(*operands, work):
     """Wrenches on the slots, base axes and origin [slots + 2, 6, B], and K v̇ − k [nc, B].
 
     slots: those of frames a and b [2, loops]; the dummy stands for the ground. rows: `Chain.row_index`.
     ground: pose of the world, seen from the base [12, B]. frames: poses of frames a and b in their slots
-    [24, loops, B]. lam: multipliers [nc, B]. The others as for `motions`. B: so many batch axes.
+    [24, loops, B]. lam: multipliers [nc, B]. The others as for `motions`. B: columns of samples, two axes.
     """
     x = dict(zip(OPERANDS, operands, strict=True))
-    B = batch_of(*(x[k] for k in FLOATS), axes=axes)
+    B = batch_of(*(x[k] for k in FLOATS), axes=2)
     walk, _, R, p, _, V, A = _kinematics(x, work, B)
     F, opening = _local(x, *at_ends(walk, x, R, p, V, A), x["lam"])
     return on_slots(walk.zeros(6, B, F.dtype), x["slots"], F), opening
@@ -162,7 +162,7 @@ def closure_tangent(given: tuple[str, ...]) -> Kernel:
             full = list(operands[:n])
             for i, y in zip(places, xs, strict=True):
                 full[i] = y
-            return closures(*full, work=Workspace(work.whole), axes=2)
+            return closures(*full, work=Workspace(work.whole))
 
         pairs = [jnp.broadcast_arrays(operands[i], t) for i, t in zip(places, operands[n:], strict=True)]
         return jax.jvp(f, *map(tuple, zip(*pairs, strict=True)))[1]
@@ -188,4 +188,4 @@ def _rule(primals, tangents):
     return out, closure_slope(primals, tangents) or [jnp.zeros_like(y) for y in out]
 
 
-closure_motion = Kernel(closures, rule=_rule)
+closure_motion = Kernel(closures, rule=_rule, grouped=True)

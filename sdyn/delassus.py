@@ -219,7 +219,7 @@ def _turned(operands, saved: Saved, y, tangents: dict):
     x = dict(zip(STRUCTURE, operands, strict=False))
     if all(tangents.get(k) is None for k in OF_CLOSURES):
         return 0.0
-    rest = jnp.zeros_like(x["ground"][:6] + y[:1]), jnp.zeros_like(x["q"] + y[:1])
+    rest = jnp.zeros((6, 1), y.dtype), jnp.zeros((len(x["q"]), 1), y.dtype)
     z = closed_solve(*operands[:n], *saved, *rest, y)[:2]
     kinematic = OPERANDS[:6]
     at = [*(x[k] for k in kinematic), *rest, *z, x["ground"], x["frames"], y]
