@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from catalogue import without_a_test
 
 import planners
 import sdyn
@@ -57,10 +58,7 @@ ROWS = {
 
 @pytest.mark.parametrize("row", ROWS)
 def test_every_row_has_its_test(row):
-    for place in ROWS[row]:
-        name, _, function = place.partition("::")
-        (path,) = Path(__file__).parent.rglob(f"{name}.py")
-        assert function in {x.name for x in ast.parse(path.read_text()).body if isinstance(x, ast.FunctionDef)}, place
+    assert not without_a_test(ROWS[row])
 
 
 def refused(*words):
