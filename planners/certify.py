@@ -210,12 +210,17 @@ class Seen:
     twist: np.ndarray  # [k, 6] rad/s, m/s
     momentum: np.ndarray  # [k, 6] about its centre of mass, N m s, N s
     centre: np.ndarray  # [k, 3] m
+    parts: np.ndarray  # [k, 6] sum of what each entry of v contributes to the momentum, absolute values
 
     @property
     def drift(self) -> np.ndarray:
         """Largest changes of the angular and of the linear momentum, [2]."""
-        change = np.abs(self.momentum - self.momentum[0])
-        return np.array([change[:, :3].max(), change[:, 3:].max()])
+        return largest(self.momentum - self.momentum[0])
+
+
+def largest(momentum) -> np.ndarray:
+    """Largest entries of the angular and of the linear part of momenta [..., 6], [2]."""
+    return np.abs(momentum).reshape(-1, 2, 3).max(axis=(0, 2))
 
 
 def see(movers) -> list[Seen]:
@@ -236,7 +241,8 @@ def see(movers) -> list[Seen]:
 def _see(chain, q, v, frame):
     def one(q, v):
         pose, twist = sdyn.frame_pose(chain, q, frame), sdyn.frame_velocity(chain, q, v, frame)
-        return *pose, twist, sdyn.momentum(chain, q, v), sdyn.centre_of_mass(chain, q)
+        parts = jax.vmap(lambda v: sdyn.momentum(chain, q, v))(jnp.diag(v))
+        return *pose, twist, parts.sum(0), sdyn.centre_of_mass(chain, q), jnp.abs(parts).sum(0)
 
     return jax.vmap(one)(q, v)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import sdyn
-from planners.certify import DRIFT, INTEGRATION, LIMIT, MOMENTUM, Row, see
+from planners.certify import DRIFT, INTEGRATION, LIMIT, MOMENTUM, Row, largest, see
 
 
 def rows(task, plan) -> list[Row]:
@@ -59,20 +59,20 @@ def _tracking(limit, hand, grip):
 
 
 def _momentum(robots, targets):
-    """Total momentum over the capture, about the compound's centre of mass, and its drift in each phase."""
+    """Total momentum over the capture, about the compound's centre of mass, and its drift in each phase.
+
+    Relative to the parts that add up to it, which are there when the total is zero.
+    """
     after, c = robots[-1].momentum[0], robots[-1].centre[0]
-    parts = [(x.momentum[-1], x.centre[-1]) for x in (robots[-2], targets[-1])]
-    arms = [np.cross(centre - c, h[3:]) for h, centre in parts]
-    angular = sum(h[:3] + arm for (h, _), arm in zip(parts, arms, strict=True)) - after[:3]
-    linear = sum(h[3:] for h, _ in parts) - after[3:]
-    scale = np.array([
-        max(np.abs([*(h[:3] for h, _ in parts), *arms, after[:3]]).max(), 1e-12),
-        max(np.abs([*(h[3:] for h, _ in parts), after[3:]]).max(), 1e-12),
-    ])
-    drift = max((x.drift / scale).max() for x in (*robots, *targets))
+    before = [(x.momentum[-1], x.centre[-1]) for x in (robots[-2], targets[-1])]
+    shifted = [np.r_[h[:3] + np.cross(centre - c, h[3:]), h[3:]] for h, centre in before]
+    scale = np.max([largest(x.parts) for x in (*robots, *targets)], axis=0)
+    relative = lambda change: np.divide(change, scale, out=np.where(change > 0, np.inf, 0.0), where=scale > 0)
+    angular, linear = relative(largest(sum(shifted) - after))
+    drift = max(relative(x.drift).max() for x in (*robots, *targets))
     return [
-        Row("angular momentum lost at the grasp, relative", float(np.abs(angular).max() / scale[0]), MOMENTUM, ""),
-        Row("linear momentum lost at the grasp, relative", float(np.abs(linear).max() / scale[1]), MOMENTUM, ""),
+        Row("angular momentum lost at the grasp, relative", float(angular), MOMENTUM, ""),
+        Row("linear momentum lost at the grasp, relative", float(linear), MOMENTUM, ""),
         Row("momentum drift within a phase, relative", float(drift), DRIFT, ""),
     ]
 
