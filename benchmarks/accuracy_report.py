@@ -112,7 +112,7 @@ def chart(result, path):
 
 
 PRESETS = (  # label, contender, its number of substeps or tolerance, side of the point
-    ("fast", "RK4, float32", 1, 1),
+    ("fast", "RK4, float32, link frame", 1, 1),
     ("balanced", "RK4", 1, -1),
     ("accurate", "RK4", 8, -1),
     ("reference", "adaptive", 1e-13, 1),

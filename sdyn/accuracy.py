@@ -70,8 +70,10 @@ def _framed(chain, frame):
     return replace(chain, inner=inner, capacity=replace(chain.capacity, frame=frame))
 
 
+# In float32 a motion in the link frame is 100 times more exact, and costs nothing in a batch (-4 % at 37 degrees of
+# freedom, 64 samples); in float64 it costs 5 %. A single sample takes about a fifth longer in either.
 PRESETS = {
-    "fast": Accuracy(dtype="float32"),
+    "fast": Accuracy(dtype="float32", frame="link"),
     "balanced": Accuracy(dtype="float64"),
     "accurate": Accuracy(dtype="float64", substeps=8),
     "reference": Accuracy("adaptive", dtype="float64", derivatives="recomputed"),

@@ -1,6 +1,7 @@
 """Trees of 7, 11 and 17 joints against data of an independent program; composites by hand; a floater in closed form."""
 
 import json
+from functools import partial
 
 import numpy as np
 import oracles
@@ -8,6 +9,7 @@ import pytest
 from functions import BIAS, FD, ID, MASS, MOTION, POSES, SLOPES, SOLVE, TOTALS, TRANSFER
 from oracles import TREES
 from structures import (
+    QUICKLY,
     STATES,
     State,
     capacity,
@@ -15,6 +17,7 @@ from structures import (
     frames_of,
     links_of,
     on_links,
+    on_states,
     padded,
     q_rate,
     real,
@@ -203,6 +206,40 @@ def test_rerooted(name, end):
     close(A[:, frames_of(old)][:, order], data["link_com_acc_and_alpha_world"], 6e-13)  # 5.1e-14
     vdot = run(FD, before, y.q, y.v, y.tau, y.gravity, y.f_ext)
     close(block(name, vdot), data["orig_nudot_same_tau"], 5e-14)  # 4.5e-15
+
+
+# -- single precision --------------------------------------------------------------------------------------------------
+
+
+@partial(on_states, **QUICKLY)
+def FAST(chain, q, v, tau, gravity, f_ext):
+    """Accelerations, mass matrix and bias."""
+    vdot = sdyn.forward_dynamics(chain, q, v, tau, gravity=gravity, f_ext=f_ext)
+    return vdot, sdyn.mass_matrix(chain, q), sdyn.bias_force(chain, q, v, gravity=gravity)
+
+
+def meets(found, want, most):
+    """In every state, by its own largest entry."""
+    for x, y in zip(np.asarray(found, float), want, strict=True):
+        close(x, y, most)
+
+
+@pytest.mark.parametrize("end", ["", "_reroot_mid", "_reroot_tip"])
+@pytest.mark.parametrize("name", TREES)
+def test_single_precision(name, end):
+    """As `fast` computes: accelerations to 5e-5, from other bases too; mass matrix and bias to 5e-6."""
+    mine, data = robot(name + end), oracles.tree(f"{name}_states")
+    data = data | oracles.tree(name + end) if end else data
+    chain = sdyn.pack(mine, capacity())
+    origin = run(POSES, chain, state_of(name + end, chain, data).q)[1][:, links_of(mine)]
+    x = state_of(name + end, chain, data, oracles.wrenches(data, data["wrench_link"], origin))
+    chain, x = sdyn.PRESETS["fast"].cast((chain, x))
+    assert (chain.dtype, chain.capacity.frame) == (np.float32, "link")
+    vdot, M, bias = run(FAST, chain, *x[:5])
+    meets(vdot[:, real(mine)], data["nudot" if end else "nudot_b"], 5e-5)  # 2e-5 from a tip, 6e-7 as declared
+    if not end:
+        meets(block(name, M), data["M"], 5e-6)  # 7e-8
+        meets(block(name, bias), data["bias_g1"], 5e-6)  # 3e-7
 
 
 # -- composites by hand ------------------------------------------------------------------------------------------------
