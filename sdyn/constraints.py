@@ -30,6 +30,7 @@ from sdyn.dynamics import inverse_dynamics, inverse_dynamics_under, passive_forc
 from sdyn.inputs import expect
 from sdyn.partition import Partition, condition, partition
 from sdyn.partition import solve as partition_solve
+from sdyn.partition import unseen
 from sdyn.semidefinite import shortest, spectrum
 
 
@@ -117,8 +118,7 @@ def constrained_dynamics(
     Returns:
         vdot: As of `forward_dynamics`.
         lam: One entry per row of the closures, the wrench on frame a in the axes and at the origin of frame a [N m,
-            N]; where it is not unique, the one with the least sum of squares. Where the redundancy turns with q, only
-            the first derivative by the default method is exact; the derivatives of vdot always are.
+            N]; where it is not unique, the one with the least sum of squares.
         status: See `Status`.
 
     Source:
@@ -214,10 +214,13 @@ def _partitioned(chain, q, v, tau, gravity, f_ext, d, pairs):
 
 @partial(_partitioned.defjvp, symbolic_zeros=True)
 def _partitioned_tangent(primals, tangents):
-    (chain, q), pairs = primals[:2], primals[-1]
+    at, pairs = primals[:2], primals[-1]
     vdot, lam = _partitioned(*primals)
     c, d = _slope(lambda *x: _residual(*x, vdot, lam), primals[:-1], tangents[:-1])
-    return (vdot, lam), partition_solve(chain, q, pairs, -c, -d)
+    dvdot, y = partition_solve(*at, pairs, -c, -d)
+    z, still = partition_solve(*at, pairs, jnp.zeros_like(vdot), lam)[0], jnp.zeros_like(vdot)
+    turn = _slope(lambda *x: closure_acceleration(*x, still, z), at, tangents[:2])  # dK z, of lam = K z
+    return (vdot, lam), (dvdot, y + unseen(*at, pairs, turn))
 
 
 def _residual(chain, q, v, tau, gravity, f_ext, d, vdot, lam):
@@ -230,6 +233,8 @@ def _slope(function, primals, tangents):
     is_zero = lambda t: isinstance(t, jax.custom_derivatives.SymbolicZero) or t.dtype == jax.dtypes.float0
     (leaves, form), along = jax.tree.flatten(primals), jax.tree.leaves(tangents)
     at = [i for i, t in enumerate(along) if not is_zero(t)]
+    if not at:
+        return jax.tree.map(jnp.zeros_like, function(*primals))
 
     def f(*xs):
         full = list(leaves)

@@ -189,7 +189,7 @@ def _solve(*operands, work):
 
 
 def _changes(x: dict, saved: Saved, state, lam, F, tangents: dict):
-    """Slopes of ID(q, v, v̇) − Kᵀ lam and of K v̇ − k, as (c0, c, d), any of them None.
+    """Slopes of ID(q, v, v̇) − Kᵀ lam, of K v̇ − k, and of the wrenches of the closures: (c0, c, d, F), any of them None.
 
     state: V0, qd, a0, qdd and G. F: all wrenches on the slots. tangents: of the operands named, at fixed lam and v̇.
     """
@@ -202,15 +202,15 @@ def _changes(x: dict, saved: Saved, state, lam, F, tangents: dict):
         (None, None, None, d("slot_value"), d("q"), d("quat"), _times(d("V0"), free), d("qd"), None, None,
          d("ground"), d("frames"), None),
     )  # fmt: skip
-    dF, opening = of_closures or (None, None)
-    dF = d("F") if dF is None else dF if d("F") is None or not d("F").size else dF + d("F")
+    turned, opening = of_closures or (None, None)
+    dF = d("F") if turned is None else turned if d("F") is None or not d("F").size else turned + d("F")
     of_bodies = slope(
         (x["slot_index"], x["slot_value"], x["base_value"], x["rotor"], x["q"], x["quat"], V0, qd, a0, qdd, G, F),
         saved.bodies,
         (None, d("slot_value"), d("base_value"), d("rotor"), d("q"), d("quat"), d("V0"), d("qd"), None, None,
          d("G"), dF),
     )  # fmt: skip
-    return *(of_bodies or (None, None)), opening
+    return *(of_bodies or (None, None)), opening, turned
 
 
 def _turned(operands, saved: Saved, y, tangents: dict):
@@ -225,14 +225,39 @@ def _turned(operands, saved: Saved, y, tangents: dict):
     at = [*(x[k] for k in kinematic), *rest, *z, x["ground"], x["frames"], y]
     along = [*map(tangents.get, kinematic), *[None] * 4, *map(tangents.get, OF_CLOSURES[3:]), None]
     slopes = closure_slope(at, along)
-    return 0.0 if slopes is None else unseen(saved.G, saved.judged[1], slopes[1])[0]
+    return 0.0 if slopes is None else unseen(*operands[:n], *saved, slopes[1])[0]
 
 
-def _unseen(G, dead, t):
-    """(1 − G⁺ G) t [nc, B] on the rows that are not dead."""
-    G, inverse = G
-    t = t * (1 - dead)
-    return ((t - product(inverse, product(G, t[:, None]))[:, 0]) * (1 - dead),)
+def _unseen(*operands, work):
+    """u = (1 − G⁺ G) t [nc, B], what K moves nothing of: Kᵀ u = 0; on the rows that are not dead."""
+    saved, t = Saved(*operands[len(STRUCTURE) : -1]), operands[-1]
+    (G, inverse), live = saved.G, 1 - saved.judged[1]
+    t = t * live
+    return ((t - product(inverse, product(G, t[:, None]))[:, 0]) * live,)
+
+
+def _unseen_rule(primals, tangents):
+    """du = (1 − G⁺ G) (dt − dK z) − w, where K z = t − u, and w the shortest of Kᵀ w = dKᵀ u."""
+    n, t, dt = len(STRUCTURE), primals[-1], tangents[-1]
+    x, saved = dict(zip(STRUCTURE, primals, strict=False)), Saved(*primals[n:-1])
+    (u,) = unseen(*primals)
+    rest = jnp.zeros((6, 1), t.dtype), jnp.zeros((len(x["q"]), 1), t.dtype)
+    along = dict(zip(STRUCTURE, tangents, strict=False))
+    slopes = _changes(x, saved, (*rest, *rest, jnp.zeros((0, 1), t.dtype)), u, _wrenches(x, u), along)
+    moved = [jnp.zeros_like(y) if c is None else c for y, c in zip(rest, slopes, strict=False)]
+    w = closed_solve(*primals[:-1], *moved, jnp.zeros_like(t))[2]
+    dt = jnp.zeros_like(t) if dt is None else dt
+    return (u,), (unseen(*primals[:-1], dt)[0] - _turned(primals, saved, t - u, along) - w,)
+
+
+def _unseen_transpose(operands, cotangents):
+    return unseen(*operands[:-1], *cotangents)
+
+
+def _wrenches(x: dict, lam):
+    """What multipliers do to the slots [slots + 2, 6, B]."""
+    rest = (jnp.zeros((6, 1), lam.dtype), jnp.zeros((len(x["q"]), 1), lam.dtype)) * 2
+    return closure_motion(*(x[k] for k in OPERANDS[:6]), *rest, x["ground"], x["frames"], lam)[0]
 
 
 def _times(x, y):
@@ -251,10 +276,12 @@ def _closed_rule(primals, tangents):
     names = STRUCTURE + MOTION
     x, along = dict(zip(names, primals, strict=True)), dict(zip(names, tangents, strict=True))
     total = F + x["F"] if x["F"].shape[0] else F
-    slopes = _changes(x, saved, (x["V0"], x["qd"], a0, qdd, x["G"]), lam, total, along)
+    *slopes, dF = _changes(x, saved, (x["V0"], x["qd"], a0, qdd, x["G"]), lam, total, along)
     given = _less([along[k] for k in ("f0", "tau", "d")], slopes, (x["f0"], x["tau"], x["d"]))
     a0, qdd, y = closed_solve(*primals[: len(STRUCTURE)], *saved, *given)
-    return out, [a0, qdd, y + _turned(primals, saved, lam, along), *(jnp.zeros_like(y) for y in out[3:])]
+    dlam = y + _turned(primals, saved, lam, along)
+    more = _wrenches(x, dlam)
+    return out, [a0, qdd, dlam, more if dF is None else more + dF, *(jnp.zeros_like(y) for y in saved)]
 
 
 def _first_three(primals, tangents):
@@ -268,18 +295,19 @@ def _solve_rule(primals, tangents):
     x, saved = dict(zip(STRUCTURE, primals, strict=False)), Saved(*primals[n : n + len(Saved._fields)])
     x0, qdd, y = out = closed_solve(*primals)
     rest, none = (jnp.zeros_like(x0), jnp.zeros_like(qdd)), jnp.zeros((0, 1), x0.dtype)
-    operands = (*primals[:3], x["slot_value"], x["q"], x["quat"], *rest, *rest, x["ground"], x["frames"], y)
-    F, _ = closure_motion(*operands)
     along = dict(zip(STRUCTURE, tangents, strict=False))
-    slopes = _changes(x, saved, (*rest, x0, qdd, none), y, F, along)
+    *slopes, _ = _changes(x, saved, (*rest, x0, qdd, none), y, _wrenches(x, y), along)
     *dx, dy = closed_solve(*primals[: n + len(saved)], *_less(tangents[-3:], slopes, primals[-3:]))
     return out, [*dx, dy + _turned(primals, saved, y, along)]
 
 
 def _solve_transpose(operands, cotangents):
-    """The transpose of [M, −Kᵀ; K, 0]⁻¹ is the same with the signs of d and y changed."""
+    """The transpose of [M, −Kᵀ; K, 0]⁻¹ is the same with the signs of d and y changed.
+
+    y has nothing of what K does not see; without that, d is possible, which the derivative of the solution asks for.
+    """
     *c, d = cotangents
-    *x, y = closed_solve(*operands[:-3], *c, -d)
+    *x, y = closed_solve(*operands[:-3], *c, unseen(*operands[:-3], d)[0] - d)
     return [z for z, b in zip((*x, -y), operands[-3:], strict=True) if b is None]
 
 
@@ -290,8 +318,8 @@ def _prepare_rule(primals, tangents):
 
 
 _linear = tuple(len(STRUCTURE) + len(Saved._fields) + k for k in range(3))
-unseen = Kernel(_unseen, linear=(2,), grouped=True)
 prepare = Kernel(_prepare, rule=_prepare_rule)
 closed_aba_saving = Kernel(_closed_aba, rule=_closed_rule)
 closed_solve = Kernel(_solve, rule=_solve_rule, linear=_linear, transpose=_solve_transpose, grouped=True)
+unseen = Kernel(_unseen, rule=_unseen_rule, linear=_linear[:1], transpose=_unseen_transpose, grouped=True)
 closed_aba = Kernel(lambda *operands, work: _closed_aba(*operands, work=work)[:3], rule=_first_three)

@@ -57,11 +57,7 @@ def partition(chain: Chain, q: Float[Array, " nq"]) -> Partition:
 def solve(chain: Chain, q, pairs: Partition, c, d):
     """x, y of M x − Kᵀ y = c, K x = d, y the shortest."""
     K, M = loop_jacobian(chain, q), mass_matrix(chain, q)
-    nc, nv = K.shape
-    live = pairs.rows < nc
-    E = (jnp.arange(nv)[:, None] == pairs.columns).astype(K.dtype)  # dependent coordinates [nv, nc]
-    P = (pairs.rows[:, None] == jnp.arange(nc)).astype(K.dtype)  # independent rows [nc, nc]
-    J = P @ K @ E + jnp.diag(1.0 - live)
+    P, E, J, live = _blocks(K, pairs)
     independent = 1 - E.sum(1)
     Pi = jnp.diag(independent) - E @ jnp.linalg.solve(J, P @ K) * independent
     x_D = E @ jnp.linalg.solve(J, P @ d)
@@ -69,8 +65,35 @@ def solve(chain: Chain, q, pairs: Partition, c, d):
     M_c = Pi.T @ M @ Pi + jnp.diag(jnp.where(empty | (independent == 0), 1.0, 0.0))
     x = Pi @ jax.scipy.linalg.solve(M_c, Pi.T @ (c - M @ x_D), assume_a="pos") + x_D
     y = jnp.linalg.solve(J.T, E.T @ (M @ x - c)) * live
-    Z = jnp.linalg.solve(J.T, (K @ E).T).T * live  # K = Z (P K): all rows, from the independent ones
-    return x, Z @ jnp.linalg.solve(Z.T @ Z + jnp.diag(1.0 - live), y)
+    Z = _all_rows(K, E, J, live)
+    return x, Z @ _of_square(Z, live, y)
+
+
+def unseen(chain: Chain, q, pairs: Partition, t):
+    """The part of t [nc] that Kᵀ maps to zero."""
+    K = loop_jacobian(chain, q)
+    _, E, J, live = _blocks(K, pairs)
+    Z = _all_rows(K, E, J, live)
+    return t - Z @ _of_square(Z, live, Z.T @ t)
+
+
+def _blocks(K, pairs):
+    """Which rows P [nc, nc] and columns E [nv, nc] were picked, J = P K E, and which pairs there are."""
+    nc, nv = K.shape
+    live = pairs.rows < nc
+    E = (jnp.arange(nv)[:, None] == pairs.columns).astype(K.dtype)
+    P = (pairs.rows[:, None] == jnp.arange(nc)).astype(K.dtype)
+    return P, E, P @ K @ E + jnp.diag(1.0 - live), live
+
+
+def _all_rows(K, E, J, live):
+    """Z of K = Z (P K): all rows, from the independent ones."""
+    return jnp.linalg.solve(J.T, (K @ E).T).T * live
+
+
+def _of_square(Z, live, t):
+    """(ZᵀZ)⁻¹ t."""
+    return jnp.linalg.solve(Z.T @ Z + jnp.diag(1.0 - live), t)
 
 
 def condition(chain: Chain, q, pairs: Partition):

@@ -133,7 +133,8 @@ def product(A, B):
 
 
 def _tangent(operands, tangents):
-    """x, and dx = S (db − dG x) + (1 − S G) dG S x: the last term turns x with the null space."""
+    """x, and dx = S (db − dG x) + (1 − S G) dG S x + S S dG (b − G x): the second term turns x with the null space, the
+    third what is seen of a b that no x reaches."""
     G, dead, tolerance, b = operands
     dG, _, _, db = tangents
     again = lambda b: solve(G, dead, tolerance, b)[0]
@@ -142,7 +143,8 @@ def _tangent(operands, tangents):
         return (x,), (again(jnp.zeros_like(b) if db is None else db),)
     dx = again((0 if db is None else db) - product(dG, x))
     turn = product(dG, again(x))
-    return (x,), (dx + turn - again(product(G, turn)),)
+    reached = again(again(product(dG, (b - product(G, x)) * (1 - dead)[:, None])))
+    return (x,), (dx + turn - again(product(G, turn)) + reached,)
 
 
 def _constant(operands, tangents):
