@@ -28,9 +28,8 @@ from sdyn.coordinates import join, rates_of, spin
 from sdyn.delassus import Saved, closed_aba, closed_aba_saving
 from sdyn.dynamics import inverse_dynamics, inverse_dynamics_under, passive_force, tree_dynamics
 from sdyn.inputs import expect
-from sdyn.partition import Partition, condition, partition
+from sdyn.partition import Partition, condition, partition, unseen
 from sdyn.partition import solve as partition_solve
-from sdyn.partition import unseen
 from sdyn.semidefinite import shortest, spectrum
 
 

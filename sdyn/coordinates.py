@@ -30,7 +30,7 @@ class Pose(NamedTuple):
 def pose_of(chain: Chain, q) -> Pose:
     """Split q; the pose of a grounded base comes from the chain."""
     capacity, nb = chain.capacity, chain.capacity.base_nq
-    ground = chain.base_value[BaseRow.POSE:]
+    ground = chain.base_value[BaseRow.POSE :]
     base = ground if nb == 0 else jnp.where(chain.free == 1, q[:7], ground) if capacity.layout == "padded" else q[:7]
     joints, quat = q[nb:], jnp.zeros((0, 4, 1), q.dtype)
     if capacity.quaternions:

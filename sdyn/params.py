@@ -50,7 +50,7 @@ def rederived(chain: Chain) -> Chain:
     """The chain with its slots, base and link poses derived anew from links, joints and lock values."""
     inertial = chain.link_mass, chain.link_com, chain.link_inertia
     value, base, link_pose = derive(jnp, chain.slot_index, chain.link_index, chain.joint_value, *inertial)
-    base_value = jnp.concatenate([base, chain.base_value[BaseRow.FREE:]])
+    base_value = jnp.concatenate([base, chain.base_value[BaseRow.FREE :]])
     inner = chain.inner
     if inner is not None:
         keys = "link_mass", "link_com", "link_inertia", "joint_value"

@@ -125,7 +125,7 @@ def _values(chain, q):
     quat = (joint[JointRow.NQ] == 4)[:, None]
     one = jnp.array([1.0, 0, 0, 0], q.dtype)
     moving = jnp.concatenate([jnp.where(quat, 0, x[:, :3]), jnp.where(quat, x, one)], 1)
-    return jnp.where(joint[JointRow.MOVES][:, None] == 1, moving, chain.joint_value[:, JointValue.LOCK:])
+    return jnp.where(joint[JointRow.MOVES][:, None] == 1, moving, chain.joint_value[:, JointValue.LOCK :])
 
 
 def _arrive(world: _World, chain: Chain, restitution):
@@ -143,10 +143,10 @@ def _arrive(world: _World, chain: Chain, restitution):
     slot, parent = chain.link_index[LinkRow.SLOT], chain.link_index[LinkRow.PARENT]
     base = jnp.argmax((slot == chain.capacity.slots) & (parent == len(R)))
     quat = product(world.base[link][base], from_matrix(world.turn[link][base]))
-    base_value = chain.base_value.at[BaseRow.POSE:].set(jnp.concatenate([p[base], quat]))
+    base_value = chain.base_value.at[BaseRow.POSE :].set(jnp.concatenate([p[base], quat]))
     chain = replace(chain, base_value=base_value)
 
-    q, v = _state(chain, base_value[BaseRow.POSE:], R[base], V[base], world.rate[joint] * known[:, None])
+    q, v = _state(chain, base_value[BaseRow.POSE :], R[base], V[base], world.rate[joint] * known[:, None])
     v, impulse = _jump(chain, q, v, R, p, V, held, restitution)
     return chain, q, v, impulse
 
@@ -165,9 +165,7 @@ def _new_links(world, chain, R, p, V):
     at = jnp.where(present & known[parent] & ~known[child], child, len(R))
     arm = (R[parent] @ place_p[..., None])[..., 0]
     turned = jnp.concatenate([V[parent][:, :3], V[parent][:, 3:] + jnp.cross(V[parent][:, :3], arm)], 1)
-    return tuple(
-        x.at[at].set(y, mode="drop") for x, y in ((R, R[parent] @ place_R), (p, p[parent] + arm), (V, turned))
-    )
+    return tuple(x.at[at].set(y, mode="drop") for x, y in ((R, R[parent] @ place_R), (p, p[parent] + arm), (V, turned)))
 
 
 def _carry(chain, value, known, R, p):
@@ -197,7 +195,7 @@ def _closed(chain, R, p):
 def _state(chain, base_pose, R, V, rate):
     """q after the change, and the guess v0 from the base's twist and the joint rates."""
     joint, nb, nv = chain.joint_index, chain.capacity.base_nq, chain.capacity.base_nv
-    value = chain.joint_value[:, JointValue.LOCK:]
+    value = chain.joint_value[:, JointValue.LOCK :]
     value = jnp.where((joint[JointRow.NQ] == 4)[:, None], value[:, 3:], jnp.pad(value[:, :3], ((0, 0), (0, 1))))
     at_q = _places(joint[JointRow.Q], joint[JointRow.NQ], 4, nb, chain.nq)
     at_v = _places(joint[JointRow.V], joint[JointRow.DOF], 3, nv, chain.nv)
