@@ -12,6 +12,7 @@ import numpy as np
 from planners import sqp
 from planners.certify import certify
 from planners.plan import Plan
+from planners.problem import Outcome
 from planners.task import Task, TaskError
 
 ACCURACIES = {"fast": 0.5, "balanced": 1.0, "accurate": 2.0, "reference": 4.0}  # multiples of the task's intervals
@@ -26,7 +27,8 @@ def plan(
 
     Args:
         task: From `planners.load`.
-        solver: "sqp".
+        solver: "sqp"; or "casadi", the referee: the task stated again in CasADi and solved by IPOPT, for a second
+            opinion, one first guess after the other.
         seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
             result that is certified is kept.
         accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
@@ -42,7 +44,7 @@ def plan(
     """
     names, wanted = _checked(solver, seeds, accuracy)
     for name in names:
-        found = _planned(task, seeds, name, progress)
+        found = _planned(task, solver, seeds, name, progress)
         error = found.certificate.worst("integrated again") if found.certificate else np.inf
         if error <= wanted or found.status == "infeasible":
             return found
@@ -50,35 +52,56 @@ def plan(
     return replace(found, status="not converged", verdict=f"{found.verdict} {said}")
 
 
-def _planned(task, seeds, accuracy, progress) -> Plan:
+def _planned(task, solver, seeds, accuracy, progress) -> Plan:
     """The plan on one grid."""
-    fine = ACCURACIES[accuracy]
-    from threadpoolctl import threadpool_limits  # importing it sets an environment variable
-
     from planners.progress import Live
 
-    module = importlib.import_module(f"planners.{task.kind}")
+    fine, module = ACCURACIES[accuracy], importlib.import_module(f"planners.{task.kind}")
     began = time.monotonic()
     with Live(task.name, seeds, show=progress, iterations=ITERATIONS, tolerance=sqp.FEASIBLE) as live:
         live.compiling("the task")
         problem = module.problem(task, fine)
         live.compiling("first guesses")
         z = module.first_guesses(task, problem, seeds)
-        live.compiling("the problem and the solver")
-        sqp.compile_all(problem, seeds)
-        history = []
-        # matrices of a few hundred rows: two threads of BLAS take twice the time of one, and far more on a busy machine
-        with threadpool_limits(1, "blas"):
-            for state in sqp.solve(problem, z, iterations=ITERATIONS):
-                best = sqp.pick(state, sqp.ranking(state)[0])
-                history.append((len(history), float(best.near.cost), float(best.violation)))
-                live.iteration(*history[-1], float(best.step), sqp.running(state))
+        ends, history = SOLVERS[solver](task, problem, z, live)
         live.compiling("the certificate")
-        options = seeds, fine, accuracy
-        ends = [sqp.pick(state, k) for k in sqp.ranking(state)]
+        options = {"solver": solver, "seeds": seeds, "accuracy": accuracy, "fine": fine}
         found = _best(_result(task, problem, module, end, np.array(history), options) for end in ends)
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
     return replace(found, timing=timing)
+
+
+def _by_sqp(task, problem, z, live) -> tuple[list[Outcome], list]:
+    """Where all starts end, the best first, and the iterations of the best."""
+    from threadpoolctl import threadpool_limits  # importing it sets an environment variable
+
+    live.compiling("the problem and the solver")
+    sqp.compile_all(problem, len(z))
+    history = []
+    # matrices of a few hundred rows: two threads of BLAS take twice the time of one, and far more on a busy machine
+    with threadpool_limits(1, "blas"):
+        for state in sqp.solve(problem, z, iterations=ITERATIONS):
+            best = sqp.pick(state, sqp.ranking(state)[0])
+            history.append((len(history), float(best.near.cost), float(best.violation)))
+            live.iteration(*history[-1], float(best.step), sqp.running(state))
+    return [sqp.outcome(sqp.pick(state, k)) for k in sqp.ranking(state)], history
+
+
+def _by_ipopt(task, problem, z, live) -> tuple[list[Outcome], list]:
+    """The same by the referee, one start after the other; of each, its end counts as an iteration."""
+    from planners import referee
+
+    ends, history = [], []
+    for k, start in enumerate(z):
+        live.compiling("the problem in CasADi")
+        programme = referee.programme(task, problem, start)
+        live.note(f"IPOPT solves from guess {k + 1} of {len(z)}.")
+        ends.append(programme.solve())
+        history.append((ends[-1].iteration, ends[-1].cost, ends[-1].violation))
+    return sorted(ends, key=lambda end: (end.status != "solved", end.cost)), history
+
+
+SOLVERS = {"sqp": _by_sqp, "casadi": _by_ipopt}
 
 
 def _best(results) -> Plan:
@@ -98,8 +121,8 @@ def _best(results) -> Plan:
 
 def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:
     """Names of the grids to try, and the error that ends it."""
-    if solver != "sqp":
-        raise TaskError(f"there is no solver {solver!r}; this version has 'sqp'.")
+    if solver not in SOLVERS:
+        raise TaskError(f"there is no solver {solver!r}; this version has {', '.join(map(repr, SOLVERS))}.")
     if not isinstance(seeds, int) or seeds < 1:
         raise TaskError(f"seeds is {seeds!r}; it must be a whole number from 1.")
     if not jax.config.jax_enable_x64:
@@ -116,35 +139,30 @@ def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:
     return tuple(ACCURACIES), wanted
 
 
-def _result(task, problem, module, state, history, options):
-    x = {name: np.asarray(value) for name, value in problem.form.split(state.z).items()}
-    seeds, fine, accuracy = options
+def _result(task, problem, module, end: Outcome, history, options):
+    x = {name: np.asarray(value) for name, value in problem.form.split(end.z).items()}
     info = {
-        "versions": {name: version(name) for name in ("sdyn", "jax", "jaxlib", "numpy")}
+        "versions": {name: version(name) for name in ("sdyn", "jax", "jaxlib", "numpy", "casadi")}
         | {"python": platform.python_version()},
-        "options": {"solver": "sqp", "seeds": seeds, "accuracy": accuracy, "fine": fine},
-        "sizes": {"variables": len(state.z), "equalities": len(state.y), "inequalities": len(state.u)},
-        "cost": float(state.near.cost),
-        "stationarity": float(state.stationarity),
+        "options": options,
+        "sizes": {"variables": len(end.z), "equalities": len(end.y), "inequalities": len(end.u)},
+        "cost": end.cost,
+        "stationarity": end.stationarity,
         "results": module.results(task, problem, x),
     }
-    phases = module.phases(task, problem.data, x, round(FINE * max(fine, 1.0)))
-    multipliers = {"equal": np.asarray(state.y), "below": np.asarray(state.u)}
-    verdict = _verdict(problem, state, x, module, info)
-    return Plan(task, phases, sqp.STATUSES[state.status], verdict, x, multipliers, history, {}, info)
+    phases = module.phases(task, problem.data, x, round(FINE * max(options["fine"], 1.0)))
+    multipliers = {"equal": end.y, "below": end.u}
+    verdict = _verdict(problem, end, x, module, info)
+    return Plan(task, phases, end.status, verdict, x, multipliers, history, {}, info)
 
 
-def _verdict(problem, state, x, module, info):
-    worst = "; ".join(f"{name} is off by {amount:.3g} {unit}" for name, amount, unit in _worst(problem, state))
-    if state.status == sqp.INFEASIBLE:
-        held = problem.holding(state.u, [name for name, _, _ in _worst(problem, state)])
+def _verdict(problem, end, x, module, info):
+    off = [row for row in problem.worst(end.equal, end.below) if row[1] > 1e-6]
+    worst = "; ".join(f"{name} is off by {amount:.3g} {unit}" for name, amount, unit in off)
+    if end.status == "infeasible":
+        held = problem.holding(end.u, [name for name, _, _ in off])
         most = f" What holds it back most is the {held}." if held else ""
         return f"No motion was found that keeps all constraints: {worst}.{most}"
-    if state.status == sqp.UNCONVERGED:
-        end = f": {worst}." if worst else "."
-        return f"The solver stopped before the optimum after {state.iteration} iterations{end}"
+    if end.status == "not converged":
+        return f"The solver stopped before the optimum after {end.iteration} iterations{f': {worst}' if worst else ''}."
     return module.sentence(x, info["results"])
-
-
-def _worst(problem, state):
-    return [x for x in problem.worst(state.near.equal, state.near.below) if x[1] > 1e-6]

@@ -41,6 +41,25 @@ class Linear(NamedTuple):
     C: jax.Array  # [i, n]
 
 
+class Outcome(NamedTuple):
+    """Where a solver ended, as numbers of the host."""
+
+    z: np.ndarray  # [n] scaled
+    cost: float
+    equal: np.ndarray  # [e]
+    below: np.ndarray  # [i]
+    y: np.ndarray  # [e] multipliers of the equalities
+    u: np.ndarray  # [i] multipliers of the inequalities
+    stationarity: float  # of the Lagrangian, relative to 1 + |gradient of the cost|
+    iteration: int
+    status: str  # solved, infeasible or not converged
+
+    @property
+    def violation(self) -> float:
+        """The largest one, scaled."""
+        return max(np.abs(self.equal).max(initial=0.0), self.below.max(initial=0.0))
+
+
 @dataclass(frozen=True)
 class Rows:
     """A group of constraint rows.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planners import qp
-from planners.problem import Form, Linear, Problem
+from planners.problem import Form, Linear, Outcome, Problem
 
 FEASIBLE = 1e-9  # scaled violation
 STATIONARY = 1e-6  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
@@ -280,3 +280,10 @@ def running(state: State) -> int:
 def pick(state: State, k: int) -> State:
     """The state of one start."""
     return jax.tree.map(lambda a: np.asarray(a[k]), state)
+
+
+def outcome(state: State) -> Outcome:
+    """What a state of one start says to those who do not know how it was found."""
+    near, status = state.near, STATUSES[state.status]
+    cost, stationarity, iteration = float(near.cost), float(state.stationarity), int(state.iteration)
+    return Outcome(state.z, cost, near.equal, near.below, state.y, state.u, stationarity, iteration, status)

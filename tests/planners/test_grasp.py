@@ -66,6 +66,15 @@ def test_the_same_plan_twice_is_identical(plan):
         assert np.array_equal(a.q, b.q) and np.array_equal(a.v, b.v) and np.array_equal(a.tau, b.tau)
 
 
+@pytest.mark.slow
+def test_both_solvers_find_the_same_minimum(plan):
+    judged = planners.plan(plan.task, solver="casadi", progress=False)
+    assert judged.status == "solved" and judged.certificate.passed, judged.verdict
+    assert abs(judged.info["cost"] - plan.info["cost"]) < 1e-4 * plan.info["cost"]
+    for found in (plan, judged):
+        assert found.certificate.worst("stationarity and complementarity") < 1e-6
+
+
 def tampered(plan, name, key, change):
     phases = [replace(p, **{key: change(getattr(p, key))}) if p.name == name else p for p in plan.phases]
     return replace(plan, phases=tuple(phases))
