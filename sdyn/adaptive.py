@@ -14,7 +14,8 @@ MOST = 4096  # steps
 
 
 def adaptive_step(chain, q, v, acceleration, t, dt, tolerance, derivatives):
-    """The state after dt; NaN where that takes more than `MOST` steps.
+    """The state after dt, and whether it was reached in `MOST` steps; from a state that is not finite, none is
+    taken.
 
     Quaternions are integrated as they stand: at these tolerances their lengths drift less than anything else.
     """
@@ -31,11 +32,19 @@ def adaptive_step(chain, q, v, acceleration, t, dt, tolerance, derivatives):
 
     least = jnp.maximum(tolerance, 8 * jnp.finfo(v.dtype).eps).astype(v.dtype)
     kept = derivatives == "stored"
+    sound = jnp.isfinite(q).all() & jnp.isfinite(v).all()
     found = diffrax.diffeqsolve(
-        diffrax.ODETerm(rates), diffrax.Dopri8(), t, t + dt, None, (q, v), saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=diffrax.PIDController(rtol=least, atol=least), max_steps=MOST, throw=False,
+        diffrax.ODETerm(rates),
+        diffrax.Dopri8(),
+        t,
+        t + jnp.where(sound, dt, 0),
+        None,
+        (q, v),
+        saveat=diffrax.SaveAt(t1=True),
+        stepsize_controller=diffrax.PIDController(rtol=least, atol=least),
+        max_steps=MOST,
+        throw=False,
         adjoint=diffrax.DirectAdjoint() if kept else diffrax.RecursiveCheckpointAdjoint(),
-    )  # fmt: skip
-    reached = found.result == diffrax.RESULTS.successful
-    q, v = (jnp.where(reached, x[-1], jnp.nan) for x in found.ys)
-    return retract(chain, q, jnp.zeros_like(v)), v
+    )
+    q, v = (x[-1] for x in found.ys)
+    return retract(chain, q, jnp.zeros_like(v)), v, sound & (found.result == diffrax.RESULTS.successful)

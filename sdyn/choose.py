@@ -66,6 +66,8 @@ def choose(chain: Chain, q, v, taus, dt, error, *, steps: int | None = None, gra
     force, steps = forces("choose", taus, steps, 0)
     run = partial(runner, chain, q, v, force, dt, steps, gravity, f_ext)
     truth, seconds = run(PRESETS["reference"])(PRESETS["reference"].tolerance)
+    if not np.isfinite(truth[0]).all():
+        raise RobotError("choose: the reference itself breaks on this motion, see `diagnose`; take shorter steps.")
     tried = [Measured(PRESETS["reference"], PRESETS["reference"].tolerance, seconds)]
     good = lambda: [x for x in tried if x.error <= wanted]
     if not good():

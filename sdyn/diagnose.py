@@ -14,7 +14,14 @@ from sdyn.coordinates import quaternions_of
 from sdyn.momentum import centre_of_mass, kinetic_energy, momentum
 from sdyn.rollout import rollout
 
-QUANTITIES = ("nothing", "q is not finite", "v is not finite", "a quaternion is not unit", "the mass matrix is refused")
+QUANTITIES = (
+    "nothing",
+    "q is not finite",
+    "v is not finite",
+    "a quaternion is not unit",
+    "the mass matrix is refused",
+    "the adaptive method ran out of steps; take a shorter dt, or a tolerance of more than 1e-13",
+)
 BATCH = 64
 
 
@@ -103,7 +110,8 @@ def _of_state(chain, q, v, gravity):
     off = jnp.abs(jnp.linalg.norm(quaternions_of(chain, q), axis=1) - 1).max(initial=0)
     condition, trust = conditioning(chain, q)
     tests = jnp.stack([~finite[0], ~finite[1], off > jnp.sqrt(eps), trust == Trust.REFUSED])
-    quantity = jnp.where(tests.any(), 1 + jnp.argmax(tests), 0)
+    given_up = jnp.isposinf(q).all() & jnp.isposinf(v).all() & (v.size > 0)  # as the adaptive method leaves it
+    quantity = jnp.where(given_up, 5, jnp.where(tests.any(), 1 + jnp.argmax(tests), 0))
 
     q, v = (jnp.where(good, x, 0) for good, x in zip(finite, (q, v), strict=True))
     energy = kinetic_energy(chain, q, v) + _potential(chain, q, gravity)

@@ -43,7 +43,8 @@ def integrate(
         dt: Step [s]; may be traced, zero or negative.
         method: "rk4" (order 4), "semi_implicit" (order 1, one evaluation), "variational" (order 2; keeps momentum to
             rounding and energy without a trend), "implicit" (order 4, A-stable, for stiff joints and forces) or
-            "adaptive" (order 8, many steps in one, to a relative and absolute error of 1e-13; needs diffrax).
+            "adaptive" (order 8, up to 4096 steps in one, to a relative and absolute error of 1e-13; where these are not
+            enough, q and v are infinite, and `diagnose` says so; needs diffrax).
         drift: How loops stay closed: "project" moves the state back after the step, in the mass metric; a number is a
             Baumgarte rate [1/s] (cheaper, but the error only decays; rate times dt at most 1), 0 does nothing. The
             variational method closes them itself.
@@ -79,6 +80,7 @@ def step(chain, q, v, force, t, dt, dial: Accuracy, *, gravity=None, f_ext=None)
             return constrained_dynamics(*x, f_ext=wrenches(t, q, v), method="partition", **options)[0]
         return forward_dynamics(*x, f_ext=wrenches(t, q, v), **options)
 
+    reached = True
     if method == "variational":
         guess = v + dt / 2 * acceleration(t, q, v)
         return variational_step(chain, q, v, force, wrenches, gravity, guess, t, dt)
@@ -90,8 +92,9 @@ def step(chain, q, v, force, t, dt, dial: Accuracy, *, gravity=None, f_ext=None)
     elif method == "implicit":
         q, v = _implicit(chain, q, v, acceleration, t, dt)
     else:
-        q, v = adaptive_step(chain, q, v, acceleration, t, dt, dial.tolerance, dial.derivatives)
-    return corrected(chain, q, v) if project and chain.capacity.rows else (q, v)
+        q, v, reached = adaptive_step(chain, q, v, acceleration, t, dt, dial.tolerance, dial.derivatives)
+    q, v = corrected(chain, q, v) if project and chain.capacity.rows else (q, v)
+    return (q, v) if reached is True else tuple(jnp.where(reached, x, jnp.inf) for x in (q, v))
 
 
 def _rk4(chain, q0, v0, acceleration, t0, dt):

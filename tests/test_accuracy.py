@@ -46,6 +46,18 @@ def test_what_a_dial_means():
     close(slopes[1], slopes[0], 1e-13)
 
 
+def test_what_the_adaptive_method_gives_up():
+    """A fast top takes more than 4096 steps for 1000 s: that is said, and nothing is NaN, nor taken for a truth."""
+    chain, (q, v), force, _, _ = scenes.fast_top()
+    options = dict(steps=3, accuracy="reference")
+    qs, vs = jax.jit(lambda: sdyn.rollout(chain, q[0], v[0], force, 1000.0, **options), **QUICKLY)()
+    assert np.isfinite(qs[0]).all() and np.isposinf(qs[1:]).all() and np.isposinf(vs[1:]).all()
+    found = sdyn.diagnose(chain, qs, vs)
+    assert found.bad_step == 1 and "State 1 is bad: the adaptive method ran out of steps" in str(found)
+    with pytest.raises(ValueError, match="the reference itself breaks"):
+        sdyn.choose(chain, q[0], v[0], force, 1000.0, "1e-6", steps=3)
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

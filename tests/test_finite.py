@@ -98,6 +98,16 @@ g = jnp.array([0.0, 0.0, -9.81])
 DOWN = dict(gravity=g)
 links = lambda c: jnp.ones((c.capacity.links, 6))
 rates = lambda c, v: v[c.capacity.base_nv :]
+
+
+def phases(c, q, v, u):
+    """Two of one structure, the second without duration."""
+    family, durations = jax.tree.map(lambda x: jnp.stack([x, x]), c), jnp.array([0.01, 0.0])
+    options = dict(method="semi_implicit", drift=1.0)
+    found = sdyn.hybrid_rollout(family, q, v, jnp.stack([u[None], u[None]]), durations, jnp.array([0, 1]), **options)
+    return found.q, found.v, found.impulse
+
+
 FUNCTIONS = {  # of a chain, q, v, and something laid out like v
     "body_poses": lambda c, q, v, u: sdyn.body_poses(c, q),
     "frame_pose": lambda c, q, v, u: sdyn.frame_pose(c, q, 6),
@@ -129,6 +139,8 @@ FUNCTIONS = {  # of a chain, q, v, and something laid out like v
     "wheels": lambda c, q, v, u: tuple(sdyn.wheels(c, q, v, ["j0"]))[:1],
     "integrate": lambda c, q, v, u: sdyn.integrate(c, q, v, u, 0.01, **DOWN),
     "rollout": lambda c, q, v, u: sdyn.rollout(c, q, v, jnp.stack([u, u]), 0.01, method="semi_implicit", drift=1.0),
+    "growth": lambda c, q, v, u: sdyn.growth(c, q, v, u[None], 0.01, method="semi_implicit", drift=1.0)[0],
+    "hybrid_rollout": phases,
     "conditioning": lambda c, q, v, u: sdyn.conditioning(c, q),
     "diagnose": lambda c, q, v, u: sdyn.diagnose(c, q[None], v[None], **DOWN),
     "transfer": lambda c, q, v, u: sdyn.transfer(c, c, q, v)[1:],
@@ -137,7 +149,7 @@ ELSEWHERE = {  # and where
     "params", "with_params", "with_locks",  # below, in every function
     "partition",  # picks rows, no numbers; its solver is `constrained_dynamics`, test_closures.py
     "forward_dynamics_jacobians",  # test_jacobians.py
-    "hybrid_rollout", "growth", "choose",  # rollouts
+    "choose",  # measures, and refuses what is not finite; test_accuracy.py
     "pad", "unpad", "pack", "capacity", "family", "load", "save", "reduce",  # host stage
 }  # fmt: skip
 CLOSED = {"project", "integrate"}  # of states that are closed, or almost

@@ -10,6 +10,7 @@ from host_dynamics import mass_matrix
 from structures import ROBOTS, TABLE, UNBALANCED, body, rotation, tree, unit
 
 import sdyn
+from sdyn.dynamics import tree_dynamics
 from sdyn.posture import link_poses
 from sdyn.rigid import merged
 
@@ -92,14 +93,32 @@ def test_only_the_loops_of_the_scene_and_no_solver_where_there_are_none():
     stiff, _ = sdyn.reduce(robot, sdyn.Scene(()), samples=0)
     assert [x.name for x in stiff.loops] == ["hold"]  # the other joined two parts of what is one link now
 
-    def primitives(robot, **rest):
+    def compiled(robot, f=sdyn.forward_dynamics, **rest):
         chain = sdyn.pack(robot)
         q, v = jnp.asarray(robot.neutral()), jnp.zeros(robot.nv)
-        jaxpr = jax.make_jaxpr(lambda q, v: sdyn.forward_dynamics(chain, q, v, v, **rest))(q, v)
-        return str(jaxpr)
+        return operations(jax.make_jaxpr(lambda q, v: f(chain, q, v, v, **rest))(q, v).jaxpr)
 
-    assert "cholesky" not in primitives(none) and len(primitives(none)) < len(primitives(both)) / 2
-    assert len(primitives(none)) < len(primitives(none, gravity=jnp.ones(3)))
+    alone = compiled(none, tree_dynamics)
+    for f in (sdyn.forward_dynamics, lambda *x: sdyn.integrate(*x, 0.01)):
+        free, held = compiled(none, f), compiled(both, f)
+        assert kernels(free) == kernels(alone) != kernels(held) and len(free) < len(held) / 2
+    assert len(compiled(none)) == len(alone) < len(compiled(none, gravity=jnp.ones(3)))
+
+
+def operations(jaxpr) -> list:
+    """All of a program, also in loops and branches."""
+    inner = lambda x: getattr(x, "jaxpr", x if hasattr(x, "eqns") else None)
+    out = []
+    for operation in jaxpr.eqns:
+        out.append(operation)
+        for part in jax.tree.leaves(list(operation.params.values()), is_leaf=lambda x: inner(x) is not None):
+            out += [] if inner(part) is None else operations(inner(part))
+    return out
+
+
+def kernels(program) -> set:
+    """The compiled sweeps and solvers that a program calls."""
+    return {operation.params["kernel"] for operation in program if "kernel" in operation.params}
 
 
 def test_scenes_that_cannot_be():
