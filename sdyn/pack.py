@@ -33,7 +33,8 @@ def pack(
             of arms is best for one sample at a time.
         frame: Where dynamics are computed, for exact sizes: in the base's "common" frame, or in each "link"'s, which
             takes up to a sixth longer and loses fewer digits far from the base, of float32 above all; derivatives and
-            closures are computed in the common one, so gradients take longer.
+            closures are computed in the common one, so gradients take longer, and so are poses, velocities and
+            accelerations of frames, which lose nothing there.
         dtype: float32 or float64; by default float64 where JAX has it switched on.
 
     Returns:
