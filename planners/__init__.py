@@ -9,6 +9,7 @@ plan.save("out/grasp")
 from planners.certify import Certificate, certify
 from planners.compare import Table, compare
 from planners.driver import plan
+from planners.ik import Posture, inverse_kinematics
 from planners.plan import PhaseResult, Plan, PlanError
 from planners.study import StudyError, study
 from planners.task import Task, TaskError, load

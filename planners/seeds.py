@@ -7,15 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-import sdyn
 from planners import floating, grasp
+from planners.ik import inverse_kinematics
 from planners.problem import Form
 from planners.sqp import merit
 from planners.task import Task
 
 TIMES, POSTURES = 12, 8  # candidates of the grasp's time, and random postures for each
-KINEMATIC_STEPS = 60
-DAMPING = 1e-3
 PENALTY = 30.0  # of the l1 violation while optax improves a guess
 DESCENT = (150, 3e-3)  # steps and rate of Adam
 
@@ -31,20 +29,9 @@ def reach(frame: str, data: grasp.Data, times, q):
 
     def one(time, q):
         R, p, _ = floating.tumbled(data.waiting, time)
-        R_goal, p_goal, _, _ = grasp.grip_motion(data, time)
-
-        def error(q):
-            R_hand, p_hand = sdyn.frame_pose(chain, floating.at_rest(q), frame)
-            return jnp.concatenate([p + R @ p_hand - p_goal, floating.logarithm(R_goal.T @ R @ R_hand)])
-
-        def step(q, _):
-            J, e = jax.jacfwd(lambda q: (error(q),) * 2, has_aux=True)(q)
-            dq = -J.T @ jnp.linalg.solve(J @ J.T + DAMPING * (e @ e + 1e-9) * jnp.eye(6), e)
-            dq = dq * jnp.minimum(1.0, 0.3 / (jnp.abs(dq).max() + 1e-12))
-            return jnp.clip(q + dq, data.position[:, 0], data.position[:, 1]), jnp.linalg.norm(e)
-
-        q, miss = jax.lax.scan(step, q, None, length=KINEMATIC_STEPS)
-        return q, miss[-1]
+        goal, start = grasp.grip_motion(data, time)[:2], jnp.concatenate([p, floating.quaternion(R), q])
+        found = inverse_kinematics(chain, frame, goal, start, limits=data.position)
+        return found.q[7:], found.error
 
     return jax.vmap(one)(times, q)
 
