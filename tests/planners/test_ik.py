@@ -63,7 +63,7 @@ def solved(name, rng, limits=BOX, shift=0.0):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_what_can_be_reached_is(name, rng):
     chain, frame, (R, p), starts, found = solved(name, rng)
-    assert (found.status == STATUSES.index("reached")).all() and found.iterations.max() < 20  # measured 15, for the seven joints
+    assert (found.status == STATUSES.index("reached")).all() and found.iterations.max() < 20  # measured 15
     R_there, p_there = placed(chain, found.q, frame)
     assert np.abs(R_there - R).max() < 1e-9 and np.abs(p_there - p).max() < 1e-9
     assert np.array_equal(found.q[:, :7], starts[:, :7])  # the base stays
