@@ -12,7 +12,7 @@ ERRORS = 1e-3, 1e-6, 1e-9, 1e-12
 COLOURS = {
     "semi-implicit": "#9aa5b1", "RK4": "#1f6fb4", "RK4, float32": "#63b3e8", "variational": "#2a9d5c",
     "implicit": "#d1495b", "adaptive": "#7b4fa3", "RK4, partition": "#e08a1e", "RK4, Baumgarte": "#8a6d3b",
-    "RK4, no stabilisation": "#444444", "RK4, link frame": "#0b3c6f", "RK4, float32, link frame": "#9fd3ef",
+    "RK4, drifting": "#444444", "RK4, link frame": "#0b3c6f", "RK4, float32, link frame": "#9fd3ef",
 }  # fmt: skip
 ADVICE = (
     ("a quick look, thousands of motions at once", "fast: float32, 1e-4 to 1e-5 where steps are short for the motion"),
@@ -46,7 +46,7 @@ def _cheapest(result):
     table = Table(title="Cheapest way to an error, ms for the motion", **LOOK)
     table.add_column("")
     for error in ERRORS:
-        table.add_column(f"{error:.0e}")
+        table.add_column(f"{error:.0e}", overflow="fold")
     table.add_column("least error", no_wrap=True)
     for name, scene in result["scenes"].items():
         cells = []
