@@ -90,8 +90,7 @@ def _error(chain, frame, goal, q):
     """What is left [6 + rows], or [3 + rows] where any rotation will do."""
     R, p = sdyn.frame_pose(chain, q, frame)
     turn = [] if goal[0] is None else [_rotation_vector(R @ goal[0].T)]
-    closures = [sdyn.loop_residual(chain, q)] if chain.capacity.loops else []
-    return jnp.concatenate([*turn, p - goal[1], *closures])
+    return jnp.concatenate([*turn, p - goal[1], sdyn.loop_residual(chain, q)])
 
 
 def _rotation_vector(R):

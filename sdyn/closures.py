@@ -3,6 +3,7 @@
 The formulas are in `closure_rows.py`, the kernels in `closure_motion.py` and `delassus.py`; here is one sample.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -102,7 +103,7 @@ def _frames(chain: Chain):
     """Poses of frames a and b in their slots [24, loops]."""
     own = cat([chain.link_pose, jnp.asarray([IDENTITY], chain.dtype)])
     ends = ends_of(*(own[link].T for link in chain.loop_index[LoopRow.A :]), chain.loop_value.T)
-    return cat([x.reshape(-1, x.shape[-1]) for x in ends])
+    return cat([x.reshape(math.prod(x.shape[:-1]), x.shape[-1]) for x in ends])
 
 
 # ---- operands of the kernels -----------------------------------------------------------------------------------------

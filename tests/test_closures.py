@@ -272,6 +272,7 @@ def test_closing_compiles_nothing():
     assert fd._cache_size() == 1
     assert sdyn.capacity([open_tree]).rows == 0
     zeros = [np.zeros(n) for n in (open_tree.nq, open_tree.nv, open_tree.nv)]
+    assert sdyn.loop_residual(sdyn.pack(open_tree), open_tree.neutral()).shape == (0,)
     count = lambda f: len(jax.make_jaxpr(f)(sdyn.pack(open_tree), *zeros).eqns)
     assert count(sdyn.forward_dynamics) == count(tree_dynamics)  # an open tree has no loop solver
 
