@@ -78,7 +78,7 @@ def chart(result, path):
 
     count = len(result["scenes"])
     rows = -(-count // 3)
-    figure, panels = plt.subplots(rows, min(count, 3), figsize=(13, 3.9 * rows + 0.7), squeeze=False)
+    figure, panels = plt.subplots(rows, min(count, 3), figsize=(13, 3.9 * rows + 1), squeeze=False)
     lines = {}
     for axes, (name, scene) in zip(panels.flat, result["scenes"].items(), strict=False):
         for contender, colour in COLOURS.items():
@@ -106,7 +106,7 @@ def chart(result, path):
         axes.set_xlabel("seconds to compute")
     figure.suptitle(f"What an error costs: one thread, {result['cpu']}")
     figure.legend(lines.values(), lines.keys(), loc="lower center", ncols=5, frameon=False)
-    figure.tight_layout(rect=(0, 0.35 / (3.9 * rows + 0.7), 1, 1))
+    figure.tight_layout(rect=(0, 0.9 / (3.9 * rows + 1), 1, 1))
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -32,8 +32,8 @@ def plan(
         seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
             result that is certified is kept.
         accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
-            balanced if left out. Or a wanted error such as "1e-6": the first of these whose motion, integrated again by
-            other code, is that close to the plan [m, rad, m/s, rad/s].
+            balanced if left out. Or a wanted error such as "1e-6": the first of these that is certified and whose motion,
+            integrated again by other code, is that close to the plan [m, rad, m/s, rad/s].
         progress: Whether to show a live table.
 
     Returns:
@@ -46,8 +46,10 @@ def plan(
     for name in names:
         found = _planned(task, solver, seeds, name, progress)
         error = found.certificate.worst("integrated again") if found.certificate else np.inf
-        if error <= wanted or found.status == "infeasible":
+        if len(names) == 1 or found.status == "infeasible" or (found.status == "solved" and error <= wanted):
             return found
+    if found.status != "solved":
+        return found
     said = f"The motion integrated again differs by {error:.1e}, and {wanted:g} was wanted."
     return replace(found, status="not converged", verdict=f"{found.verdict} {said}")
 
