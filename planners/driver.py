@@ -32,8 +32,8 @@ def plan(
         seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
             result that is certified is kept.
         accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
-            balanced if left out. Or a wanted error such as "1e-6": the first of these that is certified and whose motion,
-            integrated again by other code, is that close to the plan [m, rad, m/s, rad/s].
+            balanced if left out. Or a wanted error such as "1e-6": the first of these that is certified and whose
+            motion, integrated again by other code, is that close to the plan [m, rad, m/s, rad/s].
         progress: Whether to show a live table.
 
     Returns:

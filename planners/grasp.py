@@ -107,8 +107,12 @@ def motion(grid: Grid, x, data: Data) -> tuple[Motion, Motion, Motion]:
     steps = jnp.concatenate([jnp.broadcast_to(t / n, (n,)) for t, n in zip(T, grid.intervals, strict=True)])
     first, second, _ = grid.intervals
     split, grasp = first + second, wait + T[0] + T[1]
-    momenta = later(data.waiting, wait), floating.momentum_sum(
-        (data.waiting.coupling.mass, data.target.coupling.mass), (later(data.waiting, grasp), later(data.target, grasp))
+    momenta = (
+        later(data.waiting, wait),
+        floating.momentum_sum(
+            (data.waiting.coupling.mass, data.target.coupling.mass),
+            (later(data.waiting, grasp), later(data.target, grasp)),
+        ),
     )
     # points and midpoints of the whole grid; the grasp is there twice, once in each structure
     after_grasp = np.arange(len(path[0])) > 2 * split
@@ -255,10 +259,12 @@ def data(task: Task) -> Data:
     chaser, body = task.chaser, task.body
     resting = chaser.lock(dict(zip([j.name for j in task.joints], task.start, strict=True)))
     horizon = sum(phase.duration[1] for phase in task.phases.values())
-    q = np.stack([
-        resting.neutral(),
-        body.configuration(position=task.target.position, quaternion=task.target.quaternion),
-    ])
+    q = np.stack(
+        [
+            resting.neutral(),
+            body.configuration(position=task.target.position, quaternion=task.target.quaternion),
+        ]
+    )
     v = np.stack([np.zeros(6), task.target.twist])
     tumbles = _tumbles(sdyn.family([resting, body]), q, v, horizon)
     waiting, target = (jax.tree.map(operator.itemgetter(k), tumbles) for k in range(2))

@@ -40,9 +40,7 @@ def test_help_fits_80_columns(argv, capsys, monkeypatch):
     assert "usage: sdyn" in out and max(map(len, out.splitlines())) <= 80
 
 
-@pytest.mark.parametrize(
-    "argv", [["shw"], ["plan"], ["plan", "grasp", "--seeds", "many"], ["bench", "x"]]
-)
+@pytest.mark.parametrize("argv", [["shw"], ["plan"], ["plan", "grasp", "--seeds", "many"], ["bench", "x"]])
 def test_wrong_usage_is_exit_code_2(argv, capsys):
     assert main(argv) == 2
     assert capsys.readouterr().out == ""

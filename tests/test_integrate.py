@@ -18,7 +18,6 @@ FREE = ["one_body", "unbalanced_tree", "locked_tip_base", "screws", "all_kinds",
 EQUATIONS = ["variational", "implicit"]  # the methods that solve some in each step, and take long to compile
 
 
-
 def advance(chain, q, v, dt, steps, method, gravity=None):
     """Many steps without forces; the number of steps is traced, so that one program serves all."""
     tau = 0 * v

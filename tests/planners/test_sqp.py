@@ -68,7 +68,6 @@ def rosenbrock_on_circle(x, radius):
     return Values(0 * x[0], residual, jnp.array([x @ x - radius**2]), jnp.array([x[0] - 0.5, 0.6 - x[0]]))
 
 
-
 def ends(problem, *starts):
     return list(sqp.solve(problem, np.array(starts, float)))[-1]
 
