@@ -1,10 +1,14 @@
 """What forward dynamics costs as the work grows: joints, batch, depth and width, padding, blocks,
 what a batch shares, frames; and the memory.
 
-    python benchmarks/growth.py
+    python benchmarks/growth.py [joints batch block shape padding sharing frame]
 
-Time per sample, one thread on one core; results/growth.json and results/growth.png. About five minutes.
+Time per sample, one thread on one core; results/growth.json and results/growth.png. All of it takes ten minutes; of
+parts that are not named, the kept numbers stay, and each part says when it was measured.
 """
+
+import json
+import sys
 
 import harness
 
@@ -250,18 +254,23 @@ def chart(result, path):
     plt.close(figure)
 
 
-def main():
+def main(wanted):
     """Measure, save, show."""
     harness.one_thread()
-    result = dict(what="time per sample of forward dynamics, one thread on one core", **harness.machine())
+    kept = json.loads((harness.RESULTS / "growth.json").read_text()) if wanted else dict(measured={})
+    result = kept | dict(what="time per sample of forward dynamics, one thread on one core") | harness.machine()
     for f in (by_padding, by_frame, by_sharing, by_joints, by_batch, by_block, by_shape):
         key = f.__name__.removeprefix("by_")
+        if wanted and key not in wanted:
+            continue
         print(f"by {key}", flush=True)
         result[key] = f()
+        now = harness.machine()
+        result["measured"][key] = dict(date=now["date"], load=now["load"])
         harness.save("growth", result)
     show(result)
     chart(result, harness.RESULTS / "growth.png")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
