@@ -21,7 +21,7 @@ from planners.task import parse as parse_task
 from sdyn import doctor, json_format, urdf
 from sdyn.checks import RobotError
 
-SLOWEST = 2.0  # s, for one file: a hang, not a speed; measured 0.05 s
+SLOWEST = 20.0  # s of this thread, for one file: a hang, not a speed; measured 0.05 s
 MANY = dict(derandomize=True, deadline=None, database=None)
 
 ROBOT = json.loads(json_format.write(crowded()))
@@ -79,7 +79,7 @@ def _walk(tree, path):
 
 def computable(read, data) -> bool:
     """Whether the bytes are a robot; then everything that can be asked of it on the host works."""
-    start = time.perf_counter()
+    start = time.thread_time()
     try:
         robot = read(data)
         doctor.refuse_loose(robot)
@@ -88,7 +88,7 @@ def computable(read, data) -> bool:
         assert len(message) > 20 and "\n" not in message and message[-1] in ".?", message
         return False
     finally:
-        assert time.perf_counter() - start < SLOWEST
+        assert time.thread_time() - start < SLOWEST
     assert json_format.read(json_format.write(robot)) == robot
     M = mass_matrix(robot)
     size = np.sqrt(np.diag(M))
@@ -147,7 +147,7 @@ TASKS = ["\n".join(line.partition(" #")[0] for line in text.split("\n") if line[
 @settings(max_examples=2000, **MANY)
 @given(st.lists(TEXT_CHANGE, min_size=1, max_size=3), st.sampled_from(TASKS))
 def test_tasks(changes, text):
-    start = time.perf_counter()
+    start = time.thread_time()
     try:
         task = parse_task(rewritten(text, changes))
     except (TaskError, RobotError) as error:
@@ -157,7 +157,7 @@ def test_tasks(changes, text):
         limits = task.position_limits, task.rate_limits, task.torque_limits
         assert np.isfinite(task.first).all() and all((x[..., -1] > 0).all() for x in limits[1:]) and limits[0].ndim == 2
         count("toml", True)
-    assert time.perf_counter() - start < SLOWEST
+    assert time.thread_time() - start < SLOWEST
 
 
 @pytest.mark.parametrize(("name", "least"), [("json", 4000), ("urdf", 4000), ("toml", 2000)])
