@@ -167,17 +167,18 @@ def locally(f):
     """A function of a chain and a point x [m], over points [k, m], whose derivative is one small Jacobian per point.
 
     A tangent of the whole batch is then one matrix product, whatever the kernels inside f cost; the chains, stacked
-    [k, ...], are constants.
+    [k, ...] or one for all points, are constants.
     """
+    over = lambda chains: (0 if jnp.ndim(chains.base_value) == 2 else None, 0)
 
     @jax.custom_jvp
     def batch(chains, x):
-        return jax.vmap(f)(chains, x)
+        return jax.vmap(f, over(chains))(chains, x)
 
     @batch.defjvp
     def _(primals, tangents):
         twice = lambda chain, x: (f(chain, x),) * 2
-        J, y = jax.vmap(jax.jacfwd(twice, 1, has_aux=True))(*primals)
+        J, y = jax.vmap(jax.jacfwd(twice, 1, has_aux=True), over(primals[0]))(*primals)
         return y, jnp.einsum("kij,kj->ki", J, tangents[1])
 
     return batch
@@ -197,7 +198,7 @@ def _wrenches(chain, x):
 
 
 def couplings(chains, q) -> Coupling:
-    """Couplings at joint positions q [k, n] of as many stacked chains."""
+    """Couplings at joint positions q [k, n] of one chain, or of as many stacked chains."""
     k, n = q.shape
     parts = jnp.split(_couplings(chains, q), np.cumsum([1, 3, 9, 3 * n]), axis=1)
     shapes = ((k,), (k, 3), (k, 3, 3), (k, 3, n), (k, 3, n))
@@ -213,7 +214,7 @@ def free_torques(chains, c: Coupling, joints, v, accelerations):
     """Joint torques and accelerations of free-floating motion without external forces.
 
     Args:
-        chains, c: Stacked chains and their couplings, k of each.
+        chains, c: The chain, or k stacked ones, and k couplings.
         joints, v, accelerations: Joint positions [k, n], velocities [k, nv], joint accelerations [k, n].
 
     Returns:
@@ -228,6 +229,43 @@ def free_torques(chains, c: Coupling, joints, v, accelerations):
         return tau, jnp.concatenate([turn, push + cross(c.centre, turn), qdd])
 
     return jax.vmap(one)(c, wrench, accelerations)
+
+
+class Motion(NamedTuple):
+    """One phase on its grid of k + 1 points; the base before and the joints after."""
+
+    times: jax.Array  # [k + 1] s
+    R: jax.Array  # [k + 1, 3, 3]
+    p: jax.Array  # [k + 1, 3]
+    q: jax.Array  # [k + 1, n]
+    v: jax.Array  # [k + 1, 6 + n]
+    vdot: jax.Array  # [k + 1, 6 + n]
+    tau: jax.Array  # [k + 1, n]
+
+
+def at_zero_momentum(chain, path, times) -> Motion:
+    """Motion without momentum of a robot whose base starts at the world's origin, in its axes.
+
+    Args:
+        chain: Packed structure.
+        path: Joint positions, rates and accelerations at grid points and midpoints, [2 k + 1, n] each.
+        times: Grid points [k + 1], from zero [s].
+    """
+    c, steps, still = couplings(chain, path[0]), jnp.diff(times), jnp.zeros((len(times) - 1, 3))
+    R = attitudes(jnp.eye(3), thirds(c.compliance), thirds(drift(c, path[1])), still, steps)
+    c, (q, rate, acceleration) = jax.tree.map(lambda a: a[::2], (c, path))
+    momentum = Momentum(c.centre[0], jnp.zeros(3), jnp.zeros(3))
+    p = jax.vmap(base_position, (0, 0, 0, None))(c, R, times, momentum)
+    v = jnp.concatenate([jax.vmap(base_twist, (0, 0, 0, None))(c, R, rate, momentum), rate], axis=1)
+    tau, vdot = free_torques(chain, c, q, v, acceleration)
+    return Motion(times, R, p, q, v, vdot, tau)
+
+
+def path_quaternions(R):
+    """Unit quaternions [k, 4] along a path of rotations, without jumps of sign."""
+    quat = np.asarray(jax.jit(jax.vmap(quaternion))(jnp.asarray(R)))
+    turn = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
+    return quat * np.cumprod(np.r_[1.0, turn])[:, None]
 
 
 class Tumble(NamedTuple):

@@ -18,7 +18,8 @@ import numpy as np
 import sdyn
 from planners import floating
 from planners.bspline import Clamped
-from planners.floating import Momentum, Tumble
+from planners.floating import Momentum, Motion, Tumble, path_quaternions
+from planners.joints import effort, limit_rows, two_sided, within
 from planners.plan import PhaseResult
 from planners.problem import Block, Form, Problem, Rows, Values
 from planners.task import Task
@@ -41,18 +42,6 @@ class Data(NamedTuple):
     margin: jax.Array  # [] part of the torque kept free
     speed: jax.Array  # [] tolerance while tracking, rad/s and m/s
     weights: jax.Array  # [3] time, torque, smoothness
-
-
-class Motion(NamedTuple):
-    """One phase on its grid of k + 1 points; the base before and the joints after."""
-
-    times: jax.Array  # [k + 1] s
-    R: jax.Array  # [k + 1, 3, 3]
-    p: jax.Array  # [k + 1, 3]
-    q: jax.Array  # [k + 1, n]
-    v: jax.Array  # [k + 1, 6 + n]
-    vdot: jax.Array  # [k + 1, 6 + n]
-    tau: jax.Array  # [k + 1, n]
 
 
 @dataclass(frozen=True)
@@ -175,27 +164,6 @@ def relative(data: Data, frame: str, at: Motion):
     return hand[1] - grip[1], turn, hand[2] - grip[2], hand[3] - grip[3]
 
 
-def trapezoid(steps):
-    """Weights of the trapezoid rule, [k + 1]."""
-    return jnp.concatenate([steps / 2, jnp.zeros(1)]) + jnp.concatenate([jnp.zeros(1), steps / 2])
-
-
-def two_sided(value, lower, upper):
-    """Rows value <= upper and value >= lower, joint by joint: [..., n] to [n * rows * 2]."""
-    both = jnp.stack([value - upper, lower - value], axis=-1)
-    return jnp.moveaxis(both, -2, 0).ravel()
-
-
-def residuals(data: Data, motions):
-    """Torque, relative to its limit, and acceleration, so that half their squares are the integrals of the cost."""
-    n, out = len(data.q0), []
-    for at in motions:
-        root = jnp.sqrt(2 / n * trapezoid(jnp.diff(at.times)))[:, None]
-        out.append((root * jnp.sqrt(data.weights[1]) * at.tau / data.torque).ravel())
-        out.append((root * jnp.sqrt(data.weights[2]) * at.vdot[:, 6:]).ravel())
-    return jnp.concatenate(out)
-
-
 @dataclass(frozen=True)
 class Grasp:
     """Cost and constraints, for one grid, one frame of the hand, and the grid points of the tracking phase where it
@@ -212,19 +180,16 @@ class Grasp:
         T, splines = x["durations"], self.grid.splines
         P = control_points(self.grid, x, data.q0)
         motions = motion(self.grid, x, data)
-        rates = [s.hull(1) @ p / t / data.rate for s, p, t in zip(splines, P, T[1:], strict=True)]
-        torque = jnp.concatenate([at.tau for at in motions]) / data.torque
+        rates = [s.hull(1) @ p / t for s, p, t in zip(splines, P, T[1:], strict=True)]
         place, turn, spin, slide = relative(data, self.frame, motions[1])
         poses, ends = np.array(self.poses), np.array([0, -1])
         below = (
-            two_sided(jnp.concatenate(P), data.position[:, 0], data.position[:, 1]),
-            two_sided(jnp.concatenate(rates), -1.0, 1.0),
-            two_sided(torque, data.margin - 1, 1 - data.margin),
+            within(data, *map(jnp.concatenate, (P, rates, [at.tau for at in motions]))),
             two_sided(jnp.concatenate([spin, slide], axis=1), -data.speed / 2, data.speed / 2),
         )
         return Values(
             data.weights[0] * T.sum(),
-            residuals(data, motions),
+            jnp.concatenate([effort(data, at.times, at.tau, at.vdot[:, 6:]) for at in motions]),
             jnp.concatenate([e.ravel() for e in (place[poses], turn[poses], spin[ends], slide[ends])]),
             jnp.concatenate(below),
         )
@@ -242,16 +207,6 @@ def rows(task: Task, grid: Grid, poses):
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
     steady = Rows("velocity while tracking", 1.0, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
     return equal, (*limit_rows(task, points, points - 3, torques), steady)
-
-
-def limit_rows(task: Task, positions: int, rates: int, torques: int) -> tuple[Rows, ...]:
-    """Names of the rows of joint limits, for so many points of each."""
-    names = [j.name for j in task.joints]
-    return (
-        *(Rows(f"position limit of {n}", 1.0, "rad", (positions, 2)) for n in names),
-        *(Rows(f"rate limit of {n}", x, "rad/s", (rates, 2)) for n, x in zip(names, task.rate_limits, strict=True)),
-        *(Rows(f"torque limit of {n}", x, "N m", (torques, 2)) for n, x in zip(names, task.torque_limits, strict=True)),
-    )
 
 
 def data(task: Task) -> Data:
@@ -327,13 +282,6 @@ def _states(body, times):
     """q [k, 7] and v [k, 6] of a drifting rigid body."""
     R, p, v = map(np.asarray, _tumbled(body, jnp.asarray(times)))
     return np.hstack([p, path_quaternions(R)]), v
-
-
-def path_quaternions(R):
-    """Unit quaternions [k, 4] along a path of rotations, without jumps of sign."""
-    quat = np.asarray(jax.jit(jax.vmap(floating.quaternion))(jnp.asarray(R)))
-    turn = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
-    return quat * np.cumprod(np.r_[1.0, turn])[:, None]
 
 
 def pose_points(task: Task, grid: Grid) -> np.ndarray:

@@ -22,7 +22,8 @@ import numpy as np
 import sdyn
 from planners import floating
 from planners.bspline import Clamped
-from planners.grasp import limit_rows, path_quaternions, trapezoid, two_sided
+from planners.floating import Motion
+from planners.joints import effort, limit_rows, trapezoid, within
 from planners.plan import PhaseResult
 from planners.problem import Block, Form, Problem, Rows, Values
 from planners.task import Task
@@ -48,36 +49,19 @@ class Data(NamedTuple):
     weights: jax.Array  # [4] information, time, torque, smoothness
 
 
-class Motion(NamedTuple):
-    """The motion on the grid's k + 1 points, and the whitened sensitivities."""
-
-    times: jax.Array
-    R: jax.Array
-    p: jax.Array
-    q: jax.Array
-    v: jax.Array
-    tau: jax.Array
-    acceleration: jax.Array  # [k + 1, n] of the joints
-    sensitivity: jax.Array  # [k + 1, 9, 10] of gyro, accelerometer, attitude, per root second and nominal magnitude
-
-
 def control_points(spline: Clamped, x, q0):
     """Control points [count, n]: three at either end stand still."""
     still = jnp.broadcast_to(q0, (3, len(q0)))
     return jnp.concatenate([still, x["excite"], still])
 
 
-def _at(chain, q, rate, acceleration):
-    """Base twist and its derivative, coupling and its rate at one point of zero momentum."""
-    mass = lambda q: sdyn.mass_matrix(chain, floating.at_rest(q))[:6]
-    M, slope = jax.jvp(mass, (q,), (rate,))
-    v = -jnp.linalg.solve(M[:, :6], M[:, 6:] @ rate)
-    vdot = -jnp.linalg.solve(M[:, :6], slope[:, :6] @ v + slope[:, 6:] @ rate + M[:, 6:] @ acceleration)
-    return M[:, :6], slope[:, :6], v, vdot
-
-
-def _sensitivities(data: Data, M, slope, v, vdot):
-    """Derivatives of angular velocity and specific force for the ten parameters, [6, 10], and dw [3, 10]."""
+def _sensitivities(data: Data, q, v, vdot):
+    """Derivatives of angular velocity and specific force for the ten parameters, [6, 10], and dw [3, 10], from the
+    joints and the velocities and accelerations of everything.
+    """
+    inertia = lambda q: sdyn.mass_matrix(data.chain, floating.at_rest(q))[:6, :6]
+    M, slope = jax.jvp(inertia, (q,), (v[6:],))
+    v, vdot = v[:6], vdot[:6]
     dv = -jnp.linalg.solve(M, jnp.einsum("pij,j->ip", data.slopes, v))
     dvdot = -jnp.linalg.solve(M, jnp.einsum("pij,j->ip", data.slopes, vdot) + slope @ dv)
 
@@ -90,33 +74,21 @@ def _sensitivities(data: Data, M, slope, v, vdot):
 
 
 def motion(spline: Clamped, intervals: int, x, data: Data) -> Motion:
-    """The motion and what the sensors see of the parameters, from the variables by name."""
+    """The motion on the grid, from the variables by name."""
     T, P = x["duration"][0], control_points(spline, x, data.q0)
     s = np.linspace(0, 1, 2 * intervals + 1)
-    q, rate, acceleration = (spline.basis(s, order) @ P / T**order for order in range(3))
-    chains = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(s), *a.shape)), data.chain)
-    c = floating.couplings(chains, q)
-    still = jnp.zeros((intervals, 3))
-    steps = jnp.broadcast_to(T / intervals, (intervals,))
-    stages = floating.thirds(c.compliance), floating.thirds(floating.drift(c, rate))
-    R = floating.attitudes(jnp.eye(3), *stages, still, steps)
-    c, chains, q, rate, acceleration = jax.tree.map(lambda a: a[::2], (c, chains, q, rate, acceleration))
-    M, slope, v, vdot = jax.vmap(_at, (None, 0, 0, 0))(data.chain, q, rate, acceleration)
-    felt, spin = jax.vmap(_sensitivities, (None, 0, 0, 0, 0))(data, M, slope, v, vdot)
-    turning = R @ spin
+    path = tuple(spline.basis(s, order) @ P / T**order for order in range(3))
+    return floating.at_zero_momentum(data.chain, path, np.linspace(0, 1, intervals + 1) * T)
+
+
+def information(data: Data, at: Motion):
+    """Fisher information [10, 10] of the parameters, relative to their nominal magnitudes."""
+    felt, spin = jax.vmap(_sensitivities, (None, 0, 0, 0))(data, at.q, at.v, at.vdot)
+    turning, steps = at.R @ spin, jnp.diff(at.times)
     turned = jnp.cumsum((turning[1:] + turning[:-1]) / 2 * steps[:, None, None], axis=0)
     turned = jnp.concatenate([jnp.zeros((1, 3, 10)), turned])
-    v = jnp.concatenate([v, rate], axis=1)
-    tau, _ = floating.free_torques(chains, c, q, v, acceleration)
-    p = c.centre[0] - jnp.einsum("kij,kj->ki", R, c.centre)
-    times = jnp.linspace(0.0, 1.0, intervals + 1) * T
-    sensitivity = jnp.concatenate([felt, data.sensors[2] * turned], axis=1)
-    return Motion(times, R, p, q, v, tau, acceleration, sensitivity)
-
-
-def information(at: Motion):
-    """Fisher information [10, 10] of the parameters, relative to their nominal magnitudes."""
-    return jnp.einsum("k,kij,kil->jl", trapezoid(jnp.diff(at.times)), at.sensitivity, at.sensitivity)
+    seen = jnp.concatenate([felt, data.sensors[2] * turned], axis=1)
+    return jnp.einsum("k,kij,kil->jl", trapezoid(steps), seen, seen)
 
 
 @dataclass(frozen=True)
@@ -129,19 +101,15 @@ class Identify:
     def __call__(self, x, data: Data) -> Values:
         """The values for variables by name, physical units."""
         at, T = motion(self.spline, self.intervals, x, data), x["duration"][0]
-        P, w, n = control_points(self.spline, x, data.q0), data.weights, len(data.q0)
-        root = jnp.sqrt(2 / n * trapezoid(jnp.diff(at.times)))[:, None]
-        residual = root * jnp.sqrt(w[2]) * at.tau / data.torque, root * jnp.sqrt(w[3]) * at.acceleration
+        P, w = control_points(self.spline, x, data.q0), data.weights
         turn = (3 - jnp.einsum("ij,kij->k", at.R[0], at.R)) / (2 * (1 - jnp.cos(data.attitude)))
         below = (
-            two_sided(P, data.position[:, 0], data.position[:, 1]),
-            two_sided(self.spline.hull(1) @ P / T / data.rate, -1.0, 1.0),
-            two_sided(at.tau / data.torque, data.margin - 1, 1 - data.margin),
+            within(data, P, self.spline.hull(1) @ P / T, at.tau),
             turn - 1,
         )
         return Values(
-            w[1] * T - w[0] * jnp.linalg.slogdet(information(at))[1],
-            jnp.concatenate([r.ravel() for r in residual]),
+            w[1] * T - w[0] * jnp.linalg.slogdet(information(data, at))[1],
+            effort(data, at.times, at.tau, at.vdot[:, 6:]),
             jnp.zeros(0),
             jnp.concatenate(below),
         )
@@ -238,7 +206,7 @@ def _detailed(spline, intervals, x, data):
 def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
     """The motion on a grid `fine` times finer than the solver's, from the variables by name."""
     at = jax.tree.map(np.asarray, _detailed(*_shape(task, fine), x, data))
-    q = np.hstack([at.p, path_quaternions(at.R), at.q])
+    q = np.hstack([at.p, floating.path_quaternions(at.R), at.q])
     tau = np.hstack([np.zeros((len(at.tau), 6)), at.tau])
     return (PhaseResult("excite", task.chaser, at.times, q, at.v, tau),)
 
@@ -246,7 +214,7 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
 def results(task: Task, problem: Problem, x: dict) -> dict:
     """What the manoeuvre tells about the parameters."""
     at = _detailed(*_shape(task, 1.0), x, problem.data)
-    F = np.asarray(information(at))
+    F = np.asarray(jax.jit(information)(problem.data, at))
     values, vectors = np.linalg.eigh(F)
     sees = values > GAP**2 * values[-1]
     base = task.chaser.link(task.chaser.base)

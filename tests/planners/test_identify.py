@@ -47,7 +47,7 @@ def information(form, z, data):
     """Log of the determinant of the information of a motion."""
     values = form.values
     at = identify.motion(values.spline, values.intervals, form.split(z), data)
-    return jnp.linalg.slogdet(identify.information(at))[1]
+    return jnp.linalg.slogdet(identify.information(data, at))[1]
 
 
 @pytest.mark.slow
