@@ -24,8 +24,9 @@ from jax.interpreters import ad, batching, mlir
 
 from sdyn.workspace import Workspace
 
-BLOCK = 128
-"""Samples or columns that a CPU works on at once: long rows, and storage that fits the second cache."""
+BLOCKS, CACHE = (8, 128), 5 << 20
+"""Samples or columns that a CPU works on at once, at least and at most: long rows, and storages that fit a cache
+[bytes]. Measured: chains of 31 to 1000 joints are each within 5 % of their best block."""
 
 
 class Kernel:
@@ -133,8 +134,9 @@ def _blocked(*operands, kernel):
     shaped = _shaped(kernel, operands)
     s, B = _sizes(operands) if kernel.grouped else (math.inf, max(x.shape[-1] for x in shaped))
     s = min(s, B)
-    b = _even(s, BLOCK)
-    k = _even(B // s, max(1, BLOCK // b))
+    most = _lanes(kernel, operands, B)
+    b = _even(s, most)
+    k = _even(B // s, max(1, most // b))
 
     def part(x, corner):
         if _is_index(x) or x.shape[-1] == 1:
@@ -168,6 +170,14 @@ def _blocked(*operands, kernel):
         blocks, one = jnp.where(index.ravel()[0] >= 0, blocks, 0), jnp.where(index.ravel()[0] >= 0, one, 0)
     empty = tuple(jnp.zeros((*x.shape[:-1], B // s, s), x.dtype) for x in shaped)
     return tuple(y.reshape(x.shape) for x, y in zip(shaped, lax.fori_loop(0, one, all_blocks, empty), strict=True))
+
+
+def _lanes(kernel, operands, B) -> int:
+    """Size of a block, a power of two, whose storages fit the cache."""
+    each, (least, most) = sum(x.size * x.dtype.itemsize for x in _storages(kernel, operands)) / B, BLOCKS
+    while most > least and most * each > CACHE:
+        most //= 2
+    return most
 
 
 def _even(n: int, most: int) -> int:
