@@ -60,12 +60,6 @@ class Pinocchio(peers.Pinocchio):
         self.acceleration(k)
         self.pin.computeConstraintDynamicsDerivatives(self.model, self.data, self.models, self.datas, self.settings)
 
-    def vdot(self):
-        out = np.empty_like(self.v)
-        for k in range(len(out)):
-            out[k, self.v_at] = self.acceleration(k)
-        return out
-
 
 def main():
     robot, chain, q, v, tau = closed_states(COUNT)

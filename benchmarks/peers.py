@@ -1,8 +1,9 @@
 """The same robot in other libraries: each builds its own model from a `Robot` and gives accelerations as `sdyn` does.
 
-Robots of revolute joints with a free base, as those that are compared here. A peer has
+Speed is compared for robots of revolute joints with a free base; Pinocchio and MuJoCo take all kinds of joints, and a
+grounded base too. A peer has
 
-    name, version       what it is
+    name, package       what it is
     q, v, tau           the states that were handed in, in its own order and axes
     vdot(...)           its accelerations of these states [count, nv], in sdyn's order and axes
 
@@ -17,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import sdyn
+from sdyn.convert import rotations
+from sdyn.parts import KINDS, triad
 from sdyn.posture import link_poses
 
 
@@ -83,74 +86,86 @@ def quaternion(R) -> np.ndarray:
     return V[:, -1]
 
 
-def rotations(quats) -> np.ndarray:
-    """Rotation matrices of quaternions wxyz [..., 4]."""
-    w, x, y, z = np.moveaxis(quats, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-
-
-def from_world_base(q, v, spin, linear):
-    """[w', v'] in base axes, plain derivatives of components, from the base's accelerations: `spin` in base axes,
-    and the classical one of its origin, `linear`, in world axes."""
-    R = rotations(q[:, 3:7])
-    return np.concatenate([spin, np.einsum("nji,nj->ni", R, linear) - np.cross(v[:, :3], v[:, 3:6])], 1)
-
-
 class Pinocchio:
-    """C++ (`pin`): free flyer, linear part first, quaternion xyzw."""
+    """C++ (`pin`); joints by name in `continuous` are (cosine, sine) there."""
 
     name, package = "Pinocchio", "pin"
 
-    def __init__(self, robot, q, v, tau):
+    def __init__(self, robot, q, v, tau, continuous=()):
         import pinocchio as pin
 
         self.pin, self.model = pin, pin.Model()
         self.model.gravity.setZero()
-        at = {}
+        at = {}  # of each link, the joint that it hangs from, and its pose there
         for link, joint in along(robot):
-            if joint is None:
-                kind, place, parent = pin.JointModelFreeFlyer(), pin.SE3.Identity(), 0
+            if joint is None:  # the ground pose of a free base is the identity
+                place = pin.SE3(*robot.ground_pose)
+                free = 0 if robot.grounded else self.model.addJoint(0, pin.JointModelFreeFlyer(), place, "free")
+                at[link.name] = free, place
             else:
-                which = np.flatnonzero(np.abs(joint.axis) > 1 - 1e-12)
-                plain = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
-                upright = len(which) == 1 and joint.axis[which[0]] > 0
-                kind = plain[which[0]]() if upright else pin.JointModelRevoluteUnaligned(joint.axis)
-                place, parent = pin.SE3(joint.rotation, joint.position), at[joint.parent]
-            name = "free" if joint is None else joint.name
-            at[link.name] = self.model.addJoint(parent, kind, place, name)
+                kind, turn = self.joint(joint, joint.name in continuous)
+                parent, place = at[joint.parent]
+                place = place * pin.SE3(joint.rotation, joint.position) * turn
+                at[link.name] = self.model.addJoint(parent, kind, place, joint.name), turn.inverse()
             inertia = pin.Inertia(link.mass, link.com, link.inertia)
-            self.model.appendBodyToJoint(at[link.name], inertia, pin.SE3.Identity())
+            self.model.appendBodyToJoint(at[link.name][0], inertia, at[link.name][1])
         self.data = self.model.createData()
-        order = [self.model.idx_vs[self.model.getJointId(joint.name)] - 6 for joint in robot.joints]
-        self.to_pin = np.argsort(order)
-        self.v_at = np.r_[3:6, 0:3, 6 + self.to_pin]  # where each entry of pin's v is in ours
-        self.q = np.ascontiguousarray(q[:, np.r_[0:3, 4:7, 3, 7 + self.to_pin]])
-        self.v, self.tau = (np.ascontiguousarray(x[:, self.v_at]) for x in (v, tau))
+        self.links = [at[link.name] for link in robot.links]
+        self.convert = c = sdyn.convert.pinocchio(robot, self.model.names, self.model.nqs)
+        self.q, self.v, self.tau = (np.ascontiguousarray(x) for x in (c.to_q(q), c.to_v(q, v), c.to_tau(q, tau)))
+
+    def joint(self, joint, continuous):
+        """Its model, and the turn to that model's own axes."""
+        pin, axes = self.pin, [screw[:3] + screw[3:] for screw in joint.screws]
+        which = np.flatnonzero(np.abs(joint.axis) > 1 - 1e-12)
+        upright = len(which) == 1 and joint.axis[which[0]] > 0
+        plain = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
+        turn = pin.SE3.Identity()
+        if joint.kind == "planar" or continuous:  # which it has about z only
+            turn = pin.SE3(np.column_stack([*triad(joint.axis), joint.axis]), np.zeros(3))
+        if joint.kind == "revolute" and upright and not continuous:
+            return plain[which[0]](), turn
+        if joint.kind == "cylindrical":
+            both = pin.JointModelComposite(pin.JointModelPrismaticUnaligned(joint.axis))
+            both.addJoint(pin.JointModelRevoluteUnaligned(joint.axis))
+            return both, turn
+        made = {
+            "revolute": lambda: pin.JointModelRUBZ() if continuous else pin.JointModelRevoluteUnaligned(joint.axis),
+            "prismatic": lambda: pin.JointModelPrismaticUnaligned(joint.axis),
+            "helical": lambda: pin.JointModelHelicalUnaligned(joint.axis, joint.pitch),
+            "universal": lambda: pin.JointModelUniversal(*axes),
+            "planar": pin.JointModelPlanar,
+            "spherical": pin.JointModelSpherical,
+        }
+        return made[joint.kind](), turn
+
+    def acceleration(self, k):
+        """In its own axes, of one state."""
+        return self.pin.aba(self.model, self.data, self.q[k], self.v[k], self.tau[k])
 
     def vdot(self):
-        out = np.empty_like(self.v)
-        for k, state in enumerate(zip(self.q, self.v, self.tau, strict=True)):
-            out[k, self.v_at] = self.pin.aba(self.model, self.data, *state)
-        return out
+        found = np.array([self.acceleration(k) for k in range(len(self.q))])
+        return self.convert.from_vdot(self.q, self.v, found)
+
+    def poses(self, k):
+        """Rotations and positions of the links in the world."""
+        self.pin.forwardKinematics(self.model, self.data, self.q[k])
+        found = [self.data.oMi[j] * place for j, place in self.links]
+        return np.array([x.rotation for x in found]), np.array([x.translation for x in found])
 
     def jacobians(self):
-        """Derivatives [count, 3, nv, nv] by increments of q as sdyn's, by v and by tau."""
-        out = np.empty((len(self.q), 3, *self.v.shape[1:] * 2))
+        """Derivatives [count, 3, nv, nv] by increments of q as sdyn's, by v and by tau; of revolute joints only."""
+        out, at = np.empty((len(self.q), 3, *self.v.shape[1:] * 2)), self.convert.v_at
         for k, state in enumerate(zip(self.q, self.v, self.tau, strict=True)):
             for J, found in zip(out[k], self.pin.computeABADerivatives(self.model, self.data, *state), strict=True):
-                J[np.ix_(self.v_at, self.v_at)] = found
+                J[np.ix_(at, at)] = found
         R = rotations(self.q[:, [6, 3, 4, 5]])  # pin moves the base in its own axes
         out[:, 0, :, 3:6] = out[:, 0, :, 3:6] @ R.swapaxes(1, 2)
         return out
 
 
 class MuJoCo:
-    """C (`mujoco`): free joint, linear part in world axes; nothing collides, no gravity, no constraint."""
+    """C (`mujoco`); nothing collides, no gravity, no constraint."""
 
     name, package = "MuJoCo", "mujoco"
 
@@ -165,23 +180,30 @@ class MuJoCo:
         bodies = {}
         for link, joint in along(robot):
             parent = spec.worldbody if joint is None else bodies[joint.parent]
-            place = {} if joint is None else dict(pos=joint.position, quat=quaternion(joint.rotation))
-            body = bodies[link.name] = parent.add_body(name=link.name, **place)
+            R, p = robot.ground_pose if joint is None else (joint.rotation, joint.position)
+            body = bodies[link.name] = parent.add_body(name=link.name, pos=p, quat=quaternion(R))
             body.mass, body.ipos, body.explicitinertial = link.mass, link.com, True
             body.fullinertia = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-            if joint is None:
+            if joint is None and not robot.grounded:
                 body.add_freejoint()
-            else:
-                body.add_joint(name=joint.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=joint.axis)
+            elif joint is not None:
+                self.add(body, joint)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self.order = np.array([self.model.joint(joint.name).dofadr[0] - 6 for joint in robot.joints])
-        back = np.argsort(self.order)
-        self.ours = q, v
-        linear = np.einsum("nij,nj->ni", rotations(q[:, 3:7]), v[:, 3:6])
-        self.q = np.concatenate([q[:, :7], q[:, 7:][:, back]], 1)
-        self.v = np.concatenate([linear, v[:, :3], v[:, 6:][:, back]], 1)
-        self.tau = np.concatenate([0 * v[:, :6], tau[:, 6:][:, back]], 1)
+        self.links = [self.model.body(link.name).id for link in robot.links]
+        names = [self.model.joint(k).name for k in range(self.model.njnt)]
+        self.convert = c = sdyn.convert.mujoco(robot, names)
+        self.q, self.v, self.tau = c.to_q(q), c.to_v(q, v), c.to_tau(q, tau)
+
+    def add(self, body, joint):
+        """One joint, or one for each of its coordinates."""
+        kinds = self.mujoco.mjtJoint
+        if joint.kind == "spherical":
+            body.add_joint(name=joint.name, type=kinds.mjJNT_BALL)
+            return
+        for screw, suffix in zip(joint.screws, KINDS[joint.kind].rates, strict=True):
+            kind = kinds.mjJNT_HINGE if screw[:3].any() else kinds.mjJNT_SLIDE
+            body.add_joint(name=joint.name + suffix, type=kind, axis=screw[:3] + screw[3:])
 
     def set(self, k):
         self.data.qpos, self.data.qvel, self.data.qfrc_applied = self.q[k], self.v[k], self.tau[k]
@@ -192,11 +214,13 @@ class MuJoCo:
             self.set(k)
             self.mujoco.mj_forward(self.model, self.data)
             out[k] = self.data.qacc
-        return self.as_ours(out)
+        return self.convert.from_vdot(self.q, self.v, out)
 
-    def as_ours(self, qacc):
-        q, v = self.ours
-        return np.concatenate([from_world_base(q, v, qacc[:, 3:6], qacc[:, :3]), qacc[:, 6:][:, self.order]], 1)
+    def poses(self, k):
+        """Rotations and positions of the links in the world."""
+        self.set(k)
+        self.mujoco.mj_kinematics(self.model, self.data)
+        return self.data.xmat[self.links].reshape(-1, 3, 3), self.data.xpos[self.links]
 
 
 class MJX(MuJoCo):
@@ -218,11 +242,12 @@ class MJX(MuJoCo):
     def vdot(self):
         import jax
 
-        return self.as_ours(np.asarray(jax.jit(jax.vmap(self.accelerations))(self.q, self.v, self.tau)))
+        found = np.asarray(jax.jit(jax.vmap(self.accelerations))(self.q, self.v, self.tau))
+        return self.convert.from_vdot(self.q, self.v, found)
 
 
 class JaxSim:
-    """JAX (`jaxsim`), through an SDF file; velocities of the base in mixed representation (its origin, world axes)."""
+    """JAX (`jaxsim`), through an SDF file; velocities as MuJoCo's, but those of the base all in world axes."""
 
     name, package = "JaxSim", "jaxsim"
 
@@ -234,14 +259,14 @@ class JaxSim:
             path = Path(folder) / "robot.sdf"
             path.write_text(sdf(robot))
             self.model = js.model.JaxSimModel.build_from_model_description(path, gravity=0.0)
-        names = [joint.name for joint in robot.joints]
-        mine = [names.index(name) for name in self.model.joint_names()]
-        self.order, self.ours = np.argsort(mine), (q, v)
-        R = rotations(q[:, 3:7])
-        turn = lambda x: np.einsum("nij,nj->ni", R, x)
-        self.q = np.concatenate([q[:, :7], q[:, 7:][:, mine]], 1)
-        self.v = np.concatenate([turn(v[:, 3:6]), turn(v[:, :3]), v[:, 6:][:, mine]], 1)
-        self.tau = tau[:, 6:][:, mine]
+        self.convert = c = sdyn.convert.mujoco(robot, ["base", *self.model.joint_names()])
+        self.R = rotations(q[:, 3:7])
+        self.q, self.mixed, self.tau = c.to_q(q), c.to_v(q, v), c.to_tau(q, tau)[:, 6:]
+        self.v = self.turned(self.mixed, "nij,nj->ni")
+
+    def turned(self, x, rule):
+        """The angular part to world axes, or back."""
+        return np.concatenate([x[:, :3], np.einsum(rule, self.R, x[:, 3:6]), x[:, 6:]], 1)
 
     def accelerations(self, q, v, tau):
         """Base (linear, angular; world axes) and joints, of one state."""
@@ -255,10 +280,8 @@ class JaxSim:
     def vdot(self):
         import jax
 
-        a = np.asarray(jax.jit(jax.vmap(self.accelerations))(self.q, self.v, self.tau))
-        q, v = self.ours
-        spin = np.einsum("nji,nj->ni", rotations(q[:, 3:7]), a[:, 3:6])
-        return np.concatenate([from_world_base(q, v, spin, a[:, :3]), a[:, 6:][:, self.order]], 1)
+        found = np.asarray(jax.jit(jax.vmap(self.accelerations))(self.q, self.v, self.tau))
+        return self.convert.from_vdot(self.q, self.mixed, self.turned(found, "nji,nj->ni"))
 
 
 def sdf(robot: sdyn.Robot) -> str:

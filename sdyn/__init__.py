@@ -4,7 +4,7 @@ In reading order: parts and edits of a robot (host, raises), packing (the gate),
 """
 
 # host stage
-from sdyn import models
+from sdyn import convert, models
 from sdyn.checks import RobotError
 from sdyn.files import load, save
 from sdyn.parts import Frame, Joint, Link, Loop

@@ -63,6 +63,17 @@ def test_what_leaving_out_saves():
         assert result["error"][case] <= 1e-11
 
 
+# -- conventions of other libraries ------------------------------------------------------------------------------------
+
+
+def test_the_peers_read_states_as_they_are_meant():
+    """Of the kept run: poses, accelerations and torques of every kind of joint, free and grounded."""
+    result = json.loads((ROOT / "benchmarks" / "results" / "conventions.json").read_text())
+    cases = [result[f"{peer}, {base}"] for peer in ("Pinocchio", "MuJoCo") for base in ("free", "grounded")]
+    for case in cases:
+        assert len(case) == 3 and max(case.values()) <= 1e-12
+
+
 # -- accuracy ----------------------------------------------------------------------------------------------------------
 
 ACCURACY = json.loads((ROOT / "benchmarks" / "results" / "accuracy.json").read_text())

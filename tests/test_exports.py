@@ -53,6 +53,8 @@ SIGNATURES = {
     "regressor": ("chain q v vdot", ""),
     "params": ("chain", ""),
     "with_params": ("chain params", ""),
+    "convert.mujoco": ("robot names", ""),
+    "convert.pinocchio": ("robot names sizes", ""),
     "models.load": ("name", ""),
     "models.names": ("", ""),
     "Link": ("name mass com inertia", ""),

@@ -16,7 +16,7 @@ HOST = [
     ["parts"],
     ["posture"],
     ["robot"],
-    ["json_format", "urdf", "doctor", "drawing", "edits", "rigid"],
+    ["json_format", "urdf", "doctor", "drawing", "edits", "rigid", "convert"],
     ["files"],
     ["models"],
 ]
