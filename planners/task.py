@@ -114,6 +114,16 @@ class Passive:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Goal:
+    """Section [goal]: where the robot's frame is to be, at rest; world axes, the base starts at their origin."""
+
+    position: tuple = vector(3)
+    """m."""
+    quaternion: tuple | None = vector(4, default=None)
+    """wxyz, frame to world; any orientation if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Phase:
     """Section [phases.NAME]."""
 
@@ -179,10 +189,11 @@ class Sensors:
     """rad."""
 
 
-PHASES = {"grasp": ("wait", "approach", "track", "stabilise"), "identify": ("excite",)}
+PHASES = {"grasp": ("wait", "approach", "track", "stabilise"), "identify": ("excite",), "reach": ("reach",)}
 SECTIONS = {
     "grasp": {"robot": Chaser, "target": Passive, "limits": Limits, "tolerance": Tolerance, "weights": Weights},
     "identify": {"robot": Chaser, "limits": Limits, "sensors": Sensors, "weights": Weights},
+    "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
 }
 
 
@@ -202,6 +213,7 @@ class Task:
     body: sdyn.Robot | None = None
     """The target's structure; its names carry the prefix "target_"."""
     sensors: Sensors | None = None
+    goal: Goal | None = None
     attitude: float | None = None
     """Largest turn of the base from its start [rad]."""
     source: str = ""
@@ -395,9 +407,12 @@ def _checked(task, folder):
         low, high = phase.duration
         if not 0 <= low <= high or (name != "wait" and low <= 0):
             raise TaskError(f"duration in [phases.{name}] is {[low, high]}; give the shortest and the longest, > 0 s.")
-    if task.kind != "grasp":
+    if task.kind == "identify":
         return task
     chaser.frame(task.robot.frame)
+    if task.kind == "reach":
+        chaser.configuration(quaternion=task.goal.quaternion or (1.0, 0, 0, 0))  # refuses one that has not unit length
+        return task
     body = _model(task.target.model, folder)
     if body.grounded or body.moving:
         raise TaskError(f"[target] model {task.target.model!r} must be one free rigid body; lock its joints.")

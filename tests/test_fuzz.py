@@ -140,7 +140,7 @@ def test_urdf(changes, first):
     count("urdf", computable(urdf.read, rewritten(arm(first), changes).encode()))
 
 
-TASKS = [(FOLDER / f"{name}.toml").read_text() for name in ("grasp", "identify")]
+TASKS = [(FOLDER / f"{name}.toml").read_text() for name in ("grasp", "identify", "reach")]
 TASKS = ["\n".join(line.partition(" #")[0] for line in text.split("\n") if line[:1] != "#") for text in TASKS]
 
 

@@ -7,7 +7,7 @@ from planners.task import FOLDER, parse
 GRASP = (FOLDER / "grasp.toml").read_text()
 
 
-@pytest.mark.parametrize("name", ["grasp", "identify"])
+@pytest.mark.parametrize("name", ["grasp", "identify", "reach"])
 def test_shipped_tasks_load(name):
     task = planners.load(name)
     assert task.name == name and len(task.joints) == len(task.rate_limits) == len(task.start)

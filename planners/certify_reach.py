@@ -1,0 +1,23 @@
+"""What a reach must keep besides limits and dynamics."""
+
+import numpy as np
+
+from planners.certify import LIMIT, Row, see
+from planners.motion import rotations
+
+
+def rows(task, plan) -> list[Row]:
+    """Start, rest at both ends, the goal, zero momentum."""
+    phase = plan.phases[0]
+    (seen,) = see([(phase.robot, task.robot.frame, phase.q, phase.v)])
+    out = [
+        Row("start differs from the task's", float(np.abs(phase.q[0] - task.first).max()), 1e-12, "m, rad"),
+        Row("speed at start and end", float(np.abs(phase.v[[0, -1]]).max()), LIMIT, "rad/s, m/s"),
+        Row("distance from the goal", float(np.linalg.norm(seen.p[-1] - task.goal.position)), LIMIT, "m"),
+        Row("total momentum", float(np.abs(seen.momentum).max()), LIMIT, "N m s, N s"),
+    ]
+    if task.goal.quaternion:
+        (R,) = rotations(np.array([task.goal.quaternion]))
+        apart = np.linalg.norm(seen.R[-1] - R)  # of two rotations by a small angle, that times the root of 2
+        out.append(Row("turn from the goal", float(2 * np.arcsin(min(apart / np.sqrt(8), 1.0))), LIMIT, "rad"))
+    return out

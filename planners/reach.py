@@ -1,0 +1,213 @@
+"""A free-floating robot brings a frame from rest to a pose at rest, as a problem.
+
+Variables: the duration, unless the task fixes it; the joints' end, and the inner control points of a quintic spline of
+every joint, which starts and ends at rest by construction. Total momentum is zero: the base follows the joints. Limits
+of position, rate and torque; cost of time, torque and smoothness.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sdyn
+from planners import floating
+from planners.bspline import Clamped
+from planners.floating import Motion
+from planners.ik import inverse_kinematics
+from planners.joints import effort, limit_rows, within
+from planners.plan import PhaseResult
+from planners.problem import Block, Form, Problem, Rows, Values
+from planners.task import Task
+
+POSTURES, SPREAD = 8, 0.6  # from which inverse kinematics starts, and how far they are from the start [rad]
+
+
+class Data(NamedTuple):
+    """Numbers of one reach; all traced."""
+
+    chain: sdyn.Chain
+    frame: jax.Array  # [] number of the frame in the chain
+    goal: tuple  # (rotation [3, 3], position [3]), world axes; any rotation will do where the form says so
+    q0: jax.Array  # [n]
+    position: jax.Array  # [n, 2] limits
+    rate: jax.Array  # [n]
+    torque: jax.Array  # [n]
+    margin: jax.Array  # [] part of the torque kept free
+    duration: jax.Array  # [2] shortest and longest
+    weights: jax.Array  # [3] time, torque, smoothness
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Cost and constraints, for one grid; with or without an orientation to be reached."""
+
+    spline: Clamped
+    intervals: int
+    oriented: bool
+
+    def __call__(self, x, data: Data) -> Values:
+        """The values for variables by name, physical units."""
+        T, P = duration(x, data), control_points(self.spline, x, data.q0)
+        at = motion(self.spline, self.intervals, x, data)
+        return Values(
+            data.weights[0] * T,
+            effort(data, at.times, at.tau, at.vdot[:, 6:]),
+            miss(data, at, self.oriented),
+            within(data, P, self.spline.hull(1) @ P / T, at.tau),
+        )
+
+
+def duration(x, data: Data):
+    """The duration [s], a variable or fixed."""
+    return x["duration"][0] if "duration" in x else data.duration[0]
+
+
+def control_points(spline: Clamped, x, q0):
+    """Control points [count, n]: three at either end stand still."""
+    still = lambda q: jnp.broadcast_to(q, (3, len(q0)))
+    return jnp.concatenate([still(q0), x["reach"], still(x["end"])])
+
+
+def motion(spline: Clamped, intervals: int, x, data: Data) -> Motion:
+    """The motion on the grid, from the variables by name."""
+    T, P = duration(x, data), control_points(spline, x, data.q0)
+    s = np.linspace(0, 1, 2 * intervals + 1)
+    path = tuple(spline.basis(s, order) @ P / T**order for order in range(3))
+    return floating.at_zero_momentum(data.chain, path, np.linspace(0, 1, intervals + 1) * T)
+
+
+def miss(data: Data, at: Motion, oriented: bool):
+    """What the frame lacks to the goal at the end: place [3] in world axes; turn [3] in the goal's, to third order."""
+    R, p = sdyn.frame_pose(data.chain, floating.at_rest(at.q[-1]), data.frame)
+    R, p = at.R[-1] @ R, at.p[-1] + at.R[-1] @ p
+    turn = [floating.logarithm(data.goal[0].T @ R)] if oriented else []
+    return jnp.concatenate([p - data.goal[1], *turn])
+
+
+def data(task: Task, chain: sdyn.Chain | None = None) -> Data:
+    """The numbers of a task; the chain of its robot is packed anew, or given with a capacity that has room for it.
+
+    Where there is room for more joints, those are bound to nothing: they cost what they move, and rest.
+    """
+    chain, w, goal = sdyn.pack(task.chaser) if chain is None else chain, task.weights, task.goal
+    n = chain.nv - 6
+    room = lambda x, fill: np.concatenate([x, np.full((n - len(x), *x.shape[1:]), fill)])
+    return Data(
+        chain,
+        jnp.asarray(chain.capacity.frame_names.index(task.robot.frame)),
+        (floating.rotation(jnp.asarray(goal.quaternion or (1.0, 0, 0, 0))), jnp.asarray(goal.position)),
+        jnp.asarray(room(task.start, 0.0)),
+        jnp.asarray(room(np.clip(task.position_limits, -1e3, 1e3), [-1e3, 1e3])),
+        jnp.asarray(room(task.rate_limits, 1.0)),
+        jnp.asarray(room(task.torque_limits, 1.0)),
+        jnp.asarray(task.limits.margin),
+        jnp.asarray(task.phases["reach"].duration),
+        jnp.array([w.time, w.torque, w.smoothness]),
+    )
+
+
+def _shape(task, fine):
+    phase = task.phases["reach"]
+    return Clamped(phase.control_points), max(4, round(phase.intervals * fine))
+
+
+def problem(task: Task, fine: float = 1.0, numbers: Data | None = None) -> Problem:
+    """The problem of a task, its grid multiplied by `fine`; its numbers are made unless given."""
+    numbers = data(task) if numbers is None else numbers
+    (spline, intervals), n, frame = _shape(task, fine), len(numbers.q0), task.robot.frame
+    low, high = task.phases["reach"].duration
+    free = (Block("duration", (1,), 10.0),) if low < high else ()
+    form = Form(
+        (*free, Block("reach", (spline.count - 6, n)), Block("end", (n,))),
+        Reach(spline, intervals, task.goal.quaternion is not None),
+    )
+    equal = (Rows(f"place of {frame!r} at the end", 1.0, "m", (3,)),)
+    if task.goal.quaternion is not None:
+        equal += (Rows(f"orientation of {frame!r} at the end", 1.0, "rad", (3,)),)
+    below = limit_rows(task, spline.count, spline.count - 1, intervals + 1)
+    return Problem(form, numbers, {"duration": low}, {"duration": high}, equal, below)
+
+
+def postures(task: Task, numbers: Data, count: int = POSTURES) -> tuple[np.ndarray, np.ndarray]:
+    """Joints at the goal [count, n] by inverse kinematics, from the start and from random postures about it, and the
+    errors that are left [count] (m, rad). Those of the start come first; they are often the nearest.
+    """
+    noise = np.random.default_rng(0).normal(size=(count, len(task.joints)))
+    noise[0] = 0.0
+    starts = np.asarray(numbers.q0) + SPREAD * np.pad(noise, ((0, 0), (0, len(numbers.q0) - len(task.joints))))
+    found = _reached(numbers, task.goal.quaternion is not None, np.clip(starts, *numbers.position.T))
+    return tuple(map(np.asarray, found))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _reached(numbers: Data, oriented: bool, starts):
+    goal = numbers.goal[0] if oriented else None, numbers.goal[1]
+    centre = lambda q: sdyn.centre_of_mass(numbers.chain, floating.at_rest(q))
+
+    def one(q):
+        start = floating.at_rest(q).at[:3].set(centre(numbers.q0) - centre(q))
+        found = inverse_kinematics(numbers.chain, numbers.frame, goal, start, limits=numbers.position, floats=True)
+        return found.q[7:], found.error
+
+    return jax.vmap(one)(starts)
+
+
+def least(numbers: Data, q) -> tuple[float, float]:
+    """Duration and cost that no motion to joints q can undercut: rest to rest, without torque or dynamics.
+
+    A joint that goes as far as d in the time T has at least 12 d^2 / T^3 as the integral of its squared acceleration.
+    """
+    far = np.abs(q - np.asarray(numbers.q0))
+    low, high = np.asarray(numbers.duration)
+    time, _, smoothness = np.asarray(numbers.weights)
+    square = 12 * smoothness * np.mean(far**2)
+    best = (3 * square / time) ** 0.25 if time > 0 else high
+    T = np.clip(best, max(low, (far / np.asarray(numbers.rate)).max()), max(low, high))
+    return float(T), float(time * T + square / T**3)
+
+
+def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
+    """First guesses [count, n], scaled: straight to the postures that cost least; several are improved by a descent."""
+    from planners import seeds
+
+    numbers, form = problem.data, problem.form
+    q, miss = postures(task, numbers, max(count, POSTURES))
+    order = np.lexsort(([least(numbers, x)[1] for x in q], np.round(miss, 6)))
+    z = np.stack([guess(problem, x) for x in q[order[:count]]])
+    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+
+
+def guess(problem: Problem, q) -> np.ndarray:
+    """The straight motion to joints q, as slow as its rates ask for: variables [n], scaled."""
+    numbers, inner = problem.data, problem.form.values.spline.count - 6
+    T = np.clip(max(least(numbers, q)[0], 2 * (np.abs(q - numbers.q0) / numbers.rate).max()), *numbers.duration)
+    s = np.linspace(0, 1, inner + 2)[1:-1, None]
+    return problem.form.join({"duration": [T], "reach": (1 - s) * np.asarray(numbers.q0) + s * q, "end": q})
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _detailed(spline, intervals, x, data):
+    return motion(spline, intervals, x, data)
+
+
+def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
+    """The motion on a grid `fine` times finer than the solver's, from the variables by name."""
+    at = jax.tree.map(np.asarray, _detailed(*_shape(task, fine), x, data))
+    q = np.hstack([at.p, floating.path_quaternions(at.R), at.q])
+    tau = np.hstack([np.zeros((len(at.tau), 6)), at.tau])
+    return (PhaseResult("reach", task.chaser, at.times, q, at.v, tau),)
+
+
+def results(task: Task, problem: Problem, x: dict) -> dict:
+    """How long it takes, and where the joints end."""
+    end = dict(zip((j.name for j in task.joints), map(float, x["end"]), strict=True))
+    return {"frame": task.robot.frame, "duration_s": float(duration(x, problem.data)), "end": end}
+
+
+def sentence(x: dict, info: dict) -> str:
+    """The verdict on a solved plan."""
+    return f"The frame {info['frame']!r} is at its goal, at rest, after {info['duration_s']:.2f} s."
