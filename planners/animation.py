@@ -110,8 +110,8 @@ def _shapes(plan) -> dict:
     shapes = {}
     for phase in plan.phases:
         shapes = {**robot_shapes(phase.robot), **shapes}
-        if phase.passive:
-            shapes |= robot_shapes(phase.passive[0], ORANGE, panels=True)
+    if plan.task.body:
+        shapes |= robot_shapes(plan.task.body, ORANGE, panels=True)
     return shapes
 
 

@@ -70,6 +70,21 @@ class Clamped:
         rows = [np.concatenate([self.basis([s], k) for k in range(3)]) for s in (0.0, 1.0)]
         return np.linalg.inv(rows[0][:, :3]), np.linalg.inv(rows[1][:, -3:])
 
+    @cached_property
+    def between(self) -> tuple[np.ndarray, np.ndarray]:
+        """Maps to the control points of a curve with given position and rate at the start and rate at the end.
+
+        Returns:
+            [count, 3] from (x, T x', T x' at the end) to the curve of constant acceleration, and [count, count - 3]
+            from what is free to a curve that is zero in all three, T^2 times the acceleration: of orthonormal ones.
+        """
+        s = np.linspace(0.0, 1.0, 20 * self.count)
+        even = np.linalg.lstsq(self.basis(s), np.stack([s**0, s - s**2 / 2, s**2 / 2], axis=1))[0]
+        held = np.concatenate([self.basis([0.0]), self.basis([0.0], 1), self.basis([1.0], 1)])
+        free = np.linalg.svd(held)[2][3:].T
+        bent = self.basis(s, 2) @ free
+        return even, free @ np.linalg.inv(np.linalg.cholesky(bent.T @ bent / len(s))).T
+
 
 def _basis(knots, degree, s):
     """All basis functions of one degree at the points s, [m, len(knots) - degree - 1], by the recurrence."""

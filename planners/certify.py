@@ -100,7 +100,9 @@ def certify(task, plan) -> Certificate:
 
 
 def _limits(task, plan):
-    """Joint position, rate and torque on the fine grid: the largest excess over a limit, and which ones are touched."""
+    """Joint position, rate and torque, and what acts on the base, on the fine grid: the largest excess over a limit,
+    and which ones are touched.
+    """
     n, rows, active = len(task.joints), [], []
     rest = lambda key: np.concatenate([getattr(phase, key)[:, -n:] for phase in plan.phases])
     low, high = task.position_limits.T
@@ -114,8 +116,16 @@ def _limits(task, plan):
         rows.append(Row(f"excess over {key} limits", float(max(over.max(), 0.0)), LIMIT, unit))
         near = (over > -0.03 * widths[key]).any(axis=0)
         active += [f"the {key} limit of {task.joints[k].name}" for k in np.flatnonzero(near)]
-    free = max(np.abs(phase.tau[:, :6]).max() for phase in plan.phases)
-    return [*rows, Row("force on the free base", float(free), 0.0, "N, N m")], active
+    wrench = np.abs(np.concatenate([phase.tau[:, :6] for phase in plan.phases]))
+    if task.base is None:
+        return [*rows, Row("force on the free base", float(wrench.max()), 0.0, "N, N m")], active
+    over = wrench - task.base_limits
+    for k, (what, unit) in enumerate((("torque", "N m"), ("force", "N"))):
+        axes = slice(3 * k, 3 * k + 3)
+        rows.append(Row(f"excess over {what} limits of the base", float(max(over[:, axes].max(), 0.0)), LIMIT, unit))
+        near = (over[:, axes] > -0.03 * task.base_limits[axes]).any(axis=0)
+        active += [f"the {what} limit of the base, {axis}" for axis, held in zip("xyz", near, strict=True) if held]
+    return rows, active
 
 
 # -- motion integrated again -------------------------------------------------------------------------------------------

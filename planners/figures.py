@@ -35,6 +35,8 @@ def draw(plan, folder) -> list[Path]:
     figures |= {"base": base(plan, motions), "momentum": momenta(plan, motions)}
     if plan.task.kind == "grasp":
         figures["grasp"] = grasp(plan, motions)
+    if plan.task.kind == "detumble":
+        figures["wrench"] = wrench(plan)
     if plan.task.kind == "identify":
         figures |= {"gyro": gyro(plan, motions), "information": information(plan)}
     paths = []
@@ -141,9 +143,24 @@ def base(plan, motions) -> Figure:
     return figure
 
 
+def wrench(plan) -> Figure:
+    """Moment and force of the thrusters on the base, its axes."""
+    figure, panels = _sheet(plan, "What the thrusters do", 6, columns=3, height=2.3, dashed="limit")
+    titles = [f"{what} {axis}" for what in ("torque about", "force along") for axis in "xyz"]
+    for k, (panel, title, most) in enumerate(zip(panels, titles, plan.task.base_limits, strict=True)):
+        curves = [(phase.times, phase.tau[:, k]) for phase in plan.phases]
+        for times, values in curves:
+            panel.plot(times, values, color=BLUE, linewidth=1.3)
+        panel.set_title(title, fontsize=9, loc="left")
+        _limits(panel, np.concatenate([values for _, values in curves]), (-most, most))
+    panels[0].set_ylabel("N m", fontsize=8)
+    panels[3].set_ylabel("N", fontsize=8)
+    return figure
+
+
 def momenta(plan, motions) -> Figure:
     """Momentum of the chaser and of the target, or of the base and of the other links, and in total."""
-    caught = {link.name for _, target in motions if target for link in target.robot.links}
+    caught = {link.name for link in plan.task.body.links} if plan.task.body else set()
     base = plan.phases[0].robot.base
     lines = dict(zip(shares(motions[0], caught, base), (BLUE, RED, GREY), strict=True))
     figure, panels = _sheet(

@@ -37,7 +37,7 @@ class PhaseResult:
     v: np.ndarray
     """[k, nv]."""
     tau: np.ndarray
-    """[k, nv] N m; zero for a free base."""
+    """[k, nv]: moment [N m] and force [N] on the base, its axes, zero where it floats freely; joint torques [N m]."""
     passive: tuple[sdyn.Robot, np.ndarray, np.ndarray] | None = None
     """The separate target (robot, q [k, 7], v [k, 6]); None after the grasp."""
 
@@ -217,8 +217,6 @@ def _hash(robot) -> str:
 
 
 def _phase(task, name, arrays):
-    after = task.kind == "grasp" and name == "stabilise"
     passive = (task.body, arrays["target_q"], arrays["target_v"]) if "target_q" in arrays else None
-    return PhaseResult(
-        name, task.compound if after else task.chaser, *(arrays[k] for k in ("times", "q", "v", "tau")), passive
-    )
+    robot = task.compound if name == "stabilise" else task.chaser
+    return PhaseResult(name, robot, *(arrays[k] for k in ("times", "q", "v", "tau")), passive)

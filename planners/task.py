@@ -1,200 +1,40 @@
 """What is to be planned, and the strict reader of its description in TOML.
 
-SI units and radians everywhere. Every section of a file is one record below: its fields are the keys, those without a
-default must be given, and a key that is not a field is refused with the closest ones.
+SI units and radians everywhere. Every section of a file is one record of `sections`; a key that is not a field of it is
+refused with the closest ones.
 """
 
 import difflib
 import hashlib
 import tomllib
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 import sdyn
+from planners.sections import (
+    PHASES,
+    SECTIONS,
+    Actuators,
+    Capture,
+    Chaser,
+    Effort,
+    Goal,
+    Held,
+    Limits,
+    Passive,
+    Phase,
+    Rest,
+    Sensors,
+    TaskError,
+    Tolerance,
+    Weights,
+    is_number,
+)
 
 FOLDER = Path(__file__).parent / "tasks"
 LARGEST_FILE = 1 << 20  # bytes
-LARGEST = 1e30  # of the numbers in a task; their products stay within float64
-
-
-class TaskError(ValueError):
-    """A task that cannot be what it says; the message names the key and the remedy."""
-
-
-def _is_number(value) -> bool:
-    """Whether it is a number of a size that quantities have; true, nan and inf are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
-
-
-def number(least=-np.inf, most=np.inf, default=MISSING, whole=False):
-    """A field that holds one number."""
-
-    def check(value, where):
-        good = _is_number(value) and (isinstance(value, int) or not whole)
-        if not good or not least <= value <= most:
-            kind = "a whole number" if whole else "a number"
-            raise TaskError(f"{where} is {value!r}; it must be {kind} from {least:g} to {most:g}.")
-        return int(value) if whole else float(value)
-
-    return field(default=default, metadata={"check": check})
-
-
-def vector(size, default=MISSING):
-    """A field that holds a list of numbers."""
-
-    def check(value, where):
-        numbers = isinstance(value, list) and all(map(_is_number, value))
-        if not numbers or len(value) != size:
-            raise TaskError(f"{where} is {value!r}; it must be a list of {size} numbers.")
-        return tuple(map(float, value))
-
-    return field(default=default, metadata={"check": check})
-
-
-def text(default=MISSING):
-    """A field that holds a string."""
-
-    def check(value, where):
-        if not isinstance(value, str) or not value:
-            raise TaskError(f"{where} is {value!r}; it must be a string in quotes.")
-        return value
-
-    return field(default=default, metadata={"check": check})
-
-
-def named_numbers():
-    """A field that holds {name: number}."""
-
-    def check(value, where):
-        if not isinstance(value, dict) or not all(map(_is_number, value.values())):
-            raise TaskError(f"{where} is {value!r}; it must look like {{ joint1 = 0.3, joint2 = 1.2 }}.")
-        return {name: float(x) for name, x in value.items()}
-
-    return field(default_factory=dict, metadata={"check": check})
-
-
-def names():
-    """A field that holds a list of names."""
-
-    def check(value, where):
-        if not isinstance(value, list) or not all(isinstance(x, str) for x in value):
-            raise TaskError(f'{where} is {value!r}; it must look like ["joint1", "joint2"].')
-        return tuple(value)
-
-    return field(default=(), metadata={"check": check})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Chaser:
-    """Section [robot]: who does it, and how it starts, at rest."""
-
-    model: str = text()
-    """A shipped model, or the path of a robot file next to the task."""
-    frame: str = text(default="hand")
-    joints: dict = named_numbers()  # noqa: RUF009  (a field, as its neighbours)
-    """Joint positions at the start [rad or m]; zero where not named."""
-    moving: tuple = names()
-    """Joints that move; all of them if left out. The others are locked where `joints` has them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Passive:
-    """Section [target]: a free rigid body, its frame to be grasped, and its state at time zero."""
-
-    model: str = text()
-    frame: str = text(default="grasp")
-    position: tuple = vector(3)
-    """Of the base origin, world axes [m]."""
-    quaternion: tuple = vector(4, default=(1.0, 0.0, 0.0, 0.0))
-    """wxyz, body to world."""
-    twist: tuple = vector(6)
-    """[w; v] of the base origin, body axes [rad/s, m/s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Goal:
-    """Section [goal]: where the robot's frame is to be, at rest; world axes, the base starts at their origin."""
-
-    position: tuple = vector(3)
-    """m."""
-    quaternion: tuple | None = vector(4, default=None)
-    """wxyz, frame to world; any orientation if left out."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Phase:
-    """Section [phases.NAME]."""
-
-    duration: tuple = vector(2)
-    """Shortest and longest [s]."""
-    control_points: int = number(7, 60, default=12, whole=True)
-    """Of the quintic spline of every joint."""
-    intervals: int = number(4, 400, default=24, whole=True)
-    """Of the solver's grid; the certificate's is twelve times finer."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Section [limits]: what replaces the robot's own numbers, for all joints, and the solver's distance from them."""
-
-    rate: float | None = number(0.0, default=None)
-    """rad/s or m/s."""
-    torque: float | None = number(0.0, default=None)
-    """N m or N."""
-    margin: float = number(0.0, 0.5, default=0.01)
-    """Part of the torque limit kept free at the grid's points, so that it holds between them too."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tolerance:
-    """Section [tolerance]: how well the hand follows the target while it tracks, at all times."""
-
-    position: float = number(0.0, default=1e-3)
-    """m."""
-    angle: float = number(0.0, default=1e-3)
-    """rad."""
-    speed: float = number(0.0, default=1e-3)
-    """m/s."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Weights:
-    """Section [weights]: of the cost; each term is about 1 for a plain manoeuvre."""
-
-    time: float = number(0.0, default=0.05)
-    """1/s: times the total duration."""
-    torque: float = number(0.0, default=1.0)
-    """1/s: times the integral of the mean squared torque, relative to its limit."""
-    smoothness: float = number(0.0, default=1.0)
-    """s^3: times the integral of the mean squared joint acceleration."""
-    information: float = number(0.0, default=1.0)
-    """Times -log det of the Fisher information."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensors:
-    """Section [sensors]: what the base carries, white noise per sample; no noise given, no such sensor."""
-
-    rate: float = number(1e-3, default=10.0)
-    """Samples per second."""
-    gyro: float | None = number(1e-12, default=None)
-    """rad/s."""
-    accelerometer: float | None = number(1e-12, default=None)
-    """m/s^2, of the specific force."""
-    lever: tuple = vector(3, default=(0.0, 0.0, 0.0))
-    """Place of the accelerometer, base axes [m]."""
-    star_tracker: float | None = number(1e-12, default=None)
-    """rad."""
-
-
-PHASES = {"grasp": ("wait", "approach", "track", "stabilise"), "identify": ("excite",), "reach": ("reach",)}
-SECTIONS = {
-    "grasp": {"robot": Chaser, "target": Passive, "limits": Limits, "tolerance": Tolerance, "weights": Weights},
-    "identify": {"robot": Chaser, "limits": Limits, "sensors": Sensors, "weights": Weights},
-    "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,13 +47,16 @@ class Task:
     robot: Chaser
     phases: dict[str, Phase]
     limits: Limits
-    weights: Weights
+    weights: Weights | Effort
     tolerance: Tolerance | None = None
-    target: Passive | None = None
+    target: Passive | Held | None = None
     body: sdyn.Robot | None = None
     """The target's structure; its names carry the prefix "target_"."""
     sensors: Sensors | None = None
     goal: Goal | None = None
+    capture: Capture | None = None
+    base: Actuators | None = None
+    end: Rest | None = None
     attitude: float | None = None
     """Largest turn of the base from its start [rad]."""
     source: str = ""
@@ -260,6 +103,16 @@ class Task:
     def _bounds(self, key, override):
         own = [np.inf if getattr(j, key) is None else getattr(j, key) for j in self.joints]
         return np.array(own if override is None else [override] * len(own), float)
+
+    @property
+    def base_limits(self) -> np.ndarray:
+        """Largest moments and forces on the base, its axes, [6]; zero where it floats freely."""
+        return np.zeros(6) if self.base is None else np.r_[self.base.torque, self.base.force]
+
+    @property
+    def captured(self) -> np.ndarray:
+        """Velocity after the capture, [nv]."""
+        return np.r_[self.capture.twist, [self.capture.rates.get(joint.name, 0.0) for joint in self.joints]]
 
     @property
     def start(self) -> np.ndarray:
@@ -331,7 +184,7 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
 def _attitude(value):
     if value is None:
         return None
-    if not _is_number(value) or not 0 < value <= 3:
+    if not is_number(value) or not 0 < value <= 3:
         raise TaskError(f"attitude is {value!r}; it is the largest turn of the base, from 0 to 3 rad.")
     return float(value)
 
@@ -407,6 +260,8 @@ def _checked(task, folder):
         low, high = phase.duration
         if not 0 <= low <= high or (name != "wait" and low <= 0):
             raise TaskError(f"duration in [phases.{name}] is {[low, high]}; give the shortest and the longest, > 0 s.")
+    if task.base:
+        _check_detumbling(task)
     if task.kind == "identify":
         return task
     chaser.frame(task.robot.frame)
@@ -417,5 +272,18 @@ def _checked(task, folder):
     if body.grounded or body.moving:
         raise TaskError(f"[target] model {task.target.model!r} must be one free rigid body; lock its joints.")
     body.frame(task.target.frame)
-    body.configuration(quaternion=task.target.quaternion)  # refuses one that has not unit length
+    if task.kind == "grasp":
+        body.configuration(quaternion=task.target.quaternion)  # refuses one that has not unit length
     return replace(task, body=body.prefixed("target_"))
+
+
+def _check_detumbling(task):
+    moving = {joint.name: limit for joint, limit in zip(task.joints, task.rate_limits, strict=True)}
+    for name in (*task.base.wheels, *task.capture.rates):
+        if name not in moving:
+            raise TaskError(f"{name!r} in [base] or [capture] is no joint that moves; there are {', '.join(moving)}.")
+    for name, rate in task.capture.rates.items():
+        if abs(rate) > moving[name]:
+            raise TaskError(f"[capture] rates: {name!r} has {rate:g}, beyond its limit of {moving[name]:g}.")
+    if not (task.base_limits > 0).all():
+        raise TaskError("torque and force in [base] must be above zero; a base without them floats, as in a grasp.")

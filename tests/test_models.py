@@ -7,7 +7,7 @@ from sdyn import doctor, models
 from sdyn.checks import RobotError, is_physical
 from sdyn.posture import link_poses
 
-NAMES = ("deos7", "envisat", "ets7", "iiwa_free", "paper37", "planar3", "sat50")
+NAMES = ("deos7", "envisat", "ets7", "iiwa_free", "paper37", "planar100", "planar3", "sat50")
 # Degrees of freedom, total mass [kg], and how far ahead of its first joint a stretched arm's hand is [m].
 FACTS = {
     "deos7": (13, 696.2 + 7 * 3.3, 0.256 + 1.3245 + 0.126 + 0.9245 + 0.126 + 0.1645 + 0.1855),
@@ -15,6 +15,7 @@ FACTS = {
     "ets7": (12, 2550 + 35 + 22.5 + 21.9 + 16.5 + 26 + 18.5, None),
     "iiwa_free": (13, 1000 + 17.5, 0.2025 + 0.42 + 0.4 + 0.126),
     "paper37": (37, 696.2 + 4 * 17.5 + 3 * 5, 0.2025 + 0.42 + 0.4 + 0.126),
+    "planar100": (9, 100 + 10 + 8 + 4.1, 0.9 + 0.7 + 0.305),
     "planar3": (9, 64.859 + 2.913 + 2.646 + 1.699, 0.4488 + 0.4499 + 0.3545),
     "sat50": (6, 50.0, None),
 }

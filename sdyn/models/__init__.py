@@ -7,6 +7,7 @@
 | `iiwa_free` | LBR iiwa 14 on a free 1000 kg bus |
 | `ets7` | ETS-VII: 6-joint arm on a 2550 kg satellite |
 | `planar3` | planar 3-joint air-bearing test-bed |
+| `planar100` | planar 3-joint arm on a 100 kg chaser, of a published detumbling study |
 | `envisat`, `sat50` | targets: ENVISAT, and a 50 kg satellite |
 """
 

@@ -41,6 +41,7 @@ def plan():
         tolerance=SimpleNamespace(position=1e-3, angle=1e-3, speed=1e-3),
         robot=SimpleNamespace(frame="hand"),
         target=SimpleNamespace(frame="grasp"),
+        body=target,
     )
     return SimpleNamespace(task=task, phases=tuple(phases), status="solved")
 
@@ -144,7 +145,8 @@ def test_quaternions_and_rotations_are_inverse():
 
 def test_figures_of_an_identification(plan, tmp_path):
     results = {"sigma_percent": {"m": 0.2, "Ixx": 0.01}, "singular_values": [3.0, 1.0], "subspace": "all"}
-    task = SimpleNamespace(**{**vars(plan.task), "kind": "identify", "sensors": SimpleNamespace(gyro=1e-5)})
+    other = {"kind": "identify", "body": None, "sensors": SimpleNamespace(gyro=1e-5)}
+    task = SimpleNamespace(**{**vars(plan.task), **other})
     phase = SimpleNamespace(**{**vars(plan.phases[0]), "passive": None})
     alone = SimpleNamespace(task=task, phases=(phase,), info={"results": results})
     names = {path.stem for path in figures.draw(alone, tmp_path)}

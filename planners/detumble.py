@@ -1,0 +1,203 @@
+"""A chaser and what it has grasped come to rest, by joints, thrusters and reaction wheels, as a problem.
+
+A quintic spline holds the centre of mass, the base's attitude and the joints. Variables: the duration, the rates at
+the end, and how each coordinate's acceleration differs from even braking. Velocities at the end are zero but for a
+tolerance, and but for reaction wheels. What acts on the base and on the joints follows from inverse dynamics, and is
+kept in a box. The cost is the integral of 1 and of the squares of what acts, and the squares of the velocities at the
+end, weighted.
+
+Source: Vyas et al. (2022), Post-capture detumble trajectory stabilization for robotic active debris removal (the cost).
+"""
+
+import functools
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sdyn
+from planners import floating, flying
+from planners.bspline import Clamped
+from planners.floating import Motion
+from planners.joints import limit_rows, trapezoid, two_sided, within
+from planners.plan import PhaseResult
+from planners.problem import Block, Form, Problem, Rows, Values
+from planners.task import Task
+
+FINE = 12  # intervals of the reported effort for one of the solver's
+
+
+class Data(NamedTuple):
+    """Numbers of one task; all traced."""
+
+    chain: sdyn.Chain  # the compound
+    start: jax.Array  # [6 + n] centre of mass, rotation vector, joints
+    speed: jax.Array  # [6 + n] their rates at the start
+    position: jax.Array  # [n, 2] limits
+    rate: jax.Array  # [n]
+    torque: jax.Array  # [n]
+    wrench: jax.Array  # [6] limits of moment and force on the base
+    margin: jax.Array  # [] part of the limits of what acts that is kept free
+    rest: jax.Array  # [] tolerance of the velocities at the end
+    time: jax.Array  # [] weight, 1/s
+    weights: jax.Array  # [6 + n] of the squares of what acts
+    end_weights: jax.Array  # [6 + n] of the squares of the velocities at the end
+
+
+@dataclass(frozen=True)
+class Detumble:
+    """Cost and constraints, for one grid and the places in v of what must come to rest."""
+
+    spline: Clamped
+    intervals: int
+    resting: tuple[int, ...]
+
+    def control_points(self, x, data: Data):
+        """Control points [count, 6 + n] from the variables by name."""
+        T, (braking, bent) = x["duration"][0], self.spline.between
+        ends = jnp.stack([data.start, T * data.speed, T * x["end"]])
+        return braking @ ends + T**2 * bent @ x["acceleration"].T
+
+    def curve(self, x, data: Data):
+        """The coordinates and their first two derivatives by time at the grid's points, [k + 1, 6 + n] each."""
+        s, P = np.linspace(0, 1, self.intervals + 1), self.control_points(x, data)
+        return tuple(self.spline.basis(s, order) @ P / x["duration"][0] ** order for order in range(3))
+
+    def __call__(self, x, data: Data) -> Values:
+        """The values for variables by name, physical units."""
+        T, P, resting = x["duration"][0], self.control_points(x, data), np.array(self.resting)
+        acting, v = flying.acting(data.chain, *self.curve(x, data))
+        root = jnp.sqrt(2 * trapezoid(jnp.broadcast_to(T / self.intervals, (self.intervals,))))
+        effort = root[:, None] * jnp.sqrt(data.weights) * acting
+        left = jnp.sqrt(2 * data.end_weights) * v[-1]
+        below = (
+            within(data, P[:, 6:], self.spline.hull(1) @ P[:, 6:] / T, acting[:, 6:]),
+            two_sided(acting[:, :6] / data.wrench, data.margin - 1, 1 - data.margin),
+            two_sided(P[:, 3:6], -flying.TURN, flying.TURN),
+            two_sided(v[-1, resting] / data.rest, -1.0, 1.0),
+        )
+        residual = jnp.concatenate([effort.ravel(), left])
+        return Values(data.time * T, residual, jnp.zeros(0), jnp.concatenate(below))
+
+
+def rows(task: Task, values: Detumble) -> tuple[Rows, ...]:
+    """Names of the inequalities, in the order of the values."""
+    count, points = values.spline.count, values.intervals + 1
+    kinds = ("torque limit of the base about", "N m"), ("force limit of the base along", "N")
+    named = [(f"{words} {axis}", unit) for words, unit in kinds for axis in "xyz"]
+    wrench = [Rows(name, x, unit, (points, 2)) for (name, unit), x in zip(named, task.base_limits, strict=True)]
+    turn = Rows("turn of the base", 1.0, "rad", (3, count, 2))
+    end = Rows("velocity at the end", task.end.speed, "rad/s, m/s", (len(values.resting), 2))
+    return *limit_rows(task, count, count - 1, points), *wrench, turn, end
+
+
+@jax.jit
+def _start(chain, q, v):
+    """Coordinates, their rates, and the mass matrix at the start."""
+    return *flying.coordinates(chain, q, v), sdyn.mass_matrix(chain, q)
+
+
+def data(task: Task) -> Data:
+    """The numbers of a task."""
+    w, chain = task.weights, sdyn.pack(task.compound)
+    start, speed, _ = _start(chain, task.first, task.captured)
+    numbers = (
+        np.clip(task.position_limits, -1e3, 1e3),
+        task.rate_limits,
+        task.torque_limits,
+        task.base_limits,
+        task.limits.margin,
+        task.end.speed,
+        w.time,
+        np.repeat([w.base_torque, w.base_force, w.joint_torque], [3, 3, len(task.joints)]),
+        np.r_[[w.end_base] * 6, [w.end_joints * (joint.name not in task.base.wheels) for joint in task.joints]],
+    )
+    return Data(chain, start, speed, *map(jnp.asarray, numbers))
+
+
+def _shape(task, fine) -> Detumble:
+    phase, wheels = task.phases["stabilise"], task.base.wheels
+    resting = (k for k, name in enumerate(task.chaser.v_names) if name not in wheels)
+    return Detumble(Clamped(phase.control_points), max(4, round(phase.intervals * fine)), tuple(resting))
+
+
+def _scales(task) -> tuple[tuple, tuple]:
+    """Rates at the end, and accelerations that the limit of each coordinate's own actuator gives it alone: the next
+    powers of ten, so that slightly other limits compile nothing.
+    """
+    *_, M = _start(sdyn.pack(task.compound), task.first, task.captured)
+    turn, _, joints = np.split(np.diag(np.linalg.inv(M)), [3, 6])
+    torque, force = np.split(task.base_limits, 2)
+    accelerations = np.r_[force / M[3, 3], torque * turn, task.torque_limits * joints]
+    wheel = np.r_[np.zeros(6, bool), [joint.name in task.base.wheels for joint in task.joints]]
+    rates = np.where(wheel, np.r_[np.zeros(6), task.rate_limits], task.end.speed)
+    return tuple(tuple((10.0 ** np.round(np.log10(x))).tolist()) for x in (rates, accelerations))
+
+
+def problem(task: Task, fine: float = 1.0) -> Problem:
+    """The problem of a task, its grid multiplied by `fine`."""
+    values, (low, high) = _shape(task, fine), task.phases["stabilise"].duration
+    rates, accelerations = _scales(task)
+    blocks = (
+        Block("duration", (1,), 10.0),
+        Block("end", (len(rates),), rates),
+        Block("acceleration", (len(rates), values.spline.count - 3), accelerations),
+    )
+    return Problem(Form(blocks, values), data(task), {"duration": low}, {"duration": high}, (), rows(task, values))
+
+
+def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
+    """Even braking [count, n], scaled; several differ in duration and from even, and are improved by a descent."""
+    from planners import seeds
+
+    form, (low, high) = problem.form, task.phases["stabilise"].duration
+    rng, (_, _, bent) = np.random.default_rng(0), form.blocks
+    guesses = [form.join({"duration": np.sqrt(low * high), "end": 0.0, "acceleration": 0.0})]
+    for _ in range(count - 1):
+        T, away = np.sqrt(low * high) * (high / low) ** rng.uniform(-0.4, 0.4), rng.normal(size=bent.shape)
+        guesses.append(form.join({"duration": T, "end": 0.0, "acceleration": away * bent.unit}))
+    z = np.stack(guesses)
+    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _detailed(values: Detumble, x, data: Data) -> Motion:
+    curve = values.curve(x, data)
+    at = jax.vmap(flying.state, (None, 0, 0, 0))(data.chain, *curve)
+    times = np.linspace(0.0, 1.0, len(at.p)) * x["duration"][0]
+    return Motion(times, at.R, at.p, curve[0][:, 6:], at.v, at.vdot, at.tau)
+
+
+def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
+    """The motion on a grid `fine` times finer than the task's, from the variables by name."""
+    at = jax.tree.map(np.asarray, _detailed(_shape(task, fine), x, data))
+    q = np.hstack([at.p, floating.path_quaternions(at.R), at.q])
+    return (PhaseResult("stabilise", task.compound, at.times, q, at.v, at.tau),)
+
+
+def results(task: Task, problem: Problem, x: dict) -> dict:
+    """Time and effort, and the parts of the cost."""
+    grid, data = problem.form.values, problem.data
+    at = jax.tree.map(np.asarray, _detailed(replace(grid, intervals=FINE * grid.intervals), x, data))
+    integral = lambda y: np.trapezoid(y, at.times, axis=0)
+    effort, left = data.weights * integral(at.tau**2), np.sum(data.end_weights * at.v[-1] ** 2)
+    parts = [data.time * at.times[-1], effort[:3].sum(), effort[3:6].sum(), effort[6:].sum(), left]
+    names = ("time", "base torque", "base force", "joint torque", "speed at the end")
+    return {
+        "duration_s": float(at.times[-1]),
+        "cost_parts": dict(zip(names, map(float, parts), strict=True)),
+        "base_impulse_N_m_s": integral(np.abs(at.tau[:, :3])).tolist(),
+        "base_impulse_N_s": integral(np.abs(at.tau[:, 3:6])).tolist(),
+        "largest_base_wrench": np.abs(at.tau[:, :6]).max(axis=0).tolist(),
+        "largest_joint_torque_N_m": np.abs(at.tau[:, 6:]).max(axis=0).tolist(),
+        "velocity_at_the_end": at.v[-1].tolist(),
+    }
+
+
+def sentence(x: dict, info: dict) -> str:
+    """The verdict on a solved plan."""
+    parts = info["cost_parts"]
+    said = ", ".join(f"{name} {part:.3g}" for name, part in parts.items())
+    return f"All is at rest after {info['duration_s']:.2f} s; the cost of {sum(parts.values()):.4g} is {said}."

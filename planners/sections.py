@@ -1,0 +1,258 @@
+"""The sections of a task file: one record each, whose fields are the keys.
+
+SI units and radians everywhere. A field without a default must be given; each checks its own value.
+"""
+
+from dataclasses import MISSING, dataclass, field
+
+import numpy as np
+
+LARGEST = 1e30  # of the numbers in a task; their products stay within float64
+
+
+class TaskError(ValueError):
+    """A task that cannot be what it says; the message names the key and the remedy."""
+
+
+def is_number(value) -> bool:
+    """Whether it is a number of a size that quantities have; true, nan and inf are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def number(least=-np.inf, most=np.inf, default=MISSING, whole=False):
+    """A field that holds one number."""
+
+    def check(value, where):
+        good = is_number(value) and (isinstance(value, int) or not whole)
+        if not good or not least <= value <= most:
+            kind = "a whole number" if whole else "a number"
+            raise TaskError(f"{where} is {value!r}; it must be {kind} from {least:g} to {most:g}.")
+        return int(value) if whole else float(value)
+
+    return field(default=default, metadata={"check": check})
+
+
+def vector(size, default=MISSING):
+    """A field that holds a list of numbers."""
+
+    def check(value, where):
+        numbers = isinstance(value, list) and all(map(is_number, value))
+        if not numbers or len(value) != size:
+            raise TaskError(f"{where} is {value!r}; it must be a list of {size} numbers.")
+        return tuple(map(float, value))
+
+    return field(default=default, metadata={"check": check})
+
+
+def text(default=MISSING):
+    """A field that holds a string."""
+
+    def check(value, where):
+        if not isinstance(value, str) or not value:
+            raise TaskError(f"{where} is {value!r}; it must be a string in quotes.")
+        return value
+
+    return field(default=default, metadata={"check": check})
+
+
+def named_numbers():
+    """A field that holds {name: number}."""
+
+    def check(value, where):
+        if not isinstance(value, dict) or not all(map(is_number, value.values())):
+            raise TaskError(f"{where} is {value!r}; it must look like {{ joint1 = 0.3, joint2 = 1.2 }}.")
+        return {name: float(x) for name, x in value.items()}
+
+    return field(default_factory=dict, metadata={"check": check})
+
+
+def names():
+    """A field that holds a list of names."""
+
+    def check(value, where):
+        if not isinstance(value, list) or not all(isinstance(x, str) for x in value):
+            raise TaskError(f'{where} is {value!r}; it must look like ["joint1", "joint2"].')
+        return tuple(value)
+
+    return field(default=(), metadata={"check": check})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chaser:
+    """Section [robot]: who does it, and how it starts, at rest."""
+
+    model: str = text()
+    """A shipped model, or the path of a robot file next to the task."""
+    frame: str = text(default="hand")
+    joints: dict = named_numbers()  # noqa: RUF009  (a field, as its neighbours)
+    """Joint positions at the start [rad or m]; zero where not named."""
+    moving: tuple = names()
+    """Joints that move; all of them if left out. The others are locked where `joints` has them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passive:
+    """Section [target]: a free rigid body, its frame to be grasped, and its state at time zero."""
+
+    model: str = text()
+    frame: str = text(default="grasp")
+    position: tuple = vector(3)
+    """Of the base origin, world axes [m]."""
+    quaternion: tuple = vector(4, default=(1.0, 0.0, 0.0, 0.0))
+    """wxyz, body to world."""
+    twist: tuple = vector(6)
+    """[w; v] of the base origin, body axes [rad/s, m/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Goal:
+    """Section [goal]: where the robot's frame is to be, at rest; world axes, the base starts at their origin."""
+
+    position: tuple = vector(3)
+    """m."""
+    quaternion: tuple | None = vector(4, default=None)
+    """wxyz, frame to world; any orientation if left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held:
+    """Section [target]: a free rigid body whose frame the hand holds."""
+
+    model: str = text()
+    frame: str = text(default="grasp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capture:
+    """Section [capture]: velocities of robot and target right after it."""
+
+    twist: tuple = vector(6, default=(0.0,) * 6)
+    """[w; v] of the base's origin, base axes [rad/s, m/s]."""
+    rates: dict = named_numbers()  # noqa: RUF009  (a field, as its neighbours)
+    """Joint rates [rad/s or m/s]; zero where not named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuators:
+    """Section [base]: what moves the base, besides the reaction of the joints."""
+
+    torque: tuple = vector(3)
+    """Largest moments about the base's axes, at its origin [N m]."""
+    force: tuple = vector(3)
+    """Largest forces along the base's axes [N]."""
+    wheels: tuple = names()
+    """Joints that are reaction wheels: they may spin at the end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rest:
+    """Section [end]: what counts as rest."""
+
+    speed: float = number(1e-9, default=1e-3)
+    """Largest joint rate, and largest linear and angular speed of the base [rad/s, m/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """Section [phases.NAME]."""
+
+    duration: tuple = vector(2)
+    """Shortest and longest [s]."""
+    control_points: int = number(7, 60, default=12, whole=True)
+    """Of the quintic spline of every joint."""
+    intervals: int = number(4, 400, default=24, whole=True)
+    """Of the solver's grid; the certificate's is twelve times finer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Section [limits]: what replaces the robot's own numbers, for all joints, and the solver's distance from them."""
+
+    rate: float | None = number(0.0, default=None)
+    """rad/s or m/s."""
+    torque: float | None = number(0.0, default=None)
+    """N m or N."""
+    margin: float = number(0.0, 0.5, default=0.01)
+    """Part of the torque limit kept free at the grid's points, so that it holds between them too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """Section [tolerance]: how well the hand follows the target while it tracks, at all times."""
+
+    position: float = number(0.0, default=1e-3)
+    """m."""
+    angle: float = number(0.0, default=1e-3)
+    """rad."""
+    speed: float = number(0.0, default=1e-3)
+    """m/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Section [weights]: of the cost; each term is about 1 for a plain manoeuvre."""
+
+    time: float = number(0.0, default=0.05)
+    """1/s: times the total duration."""
+    torque: float = number(0.0, default=1.0)
+    """1/s: times the integral of the mean squared torque, relative to its limit."""
+    smoothness: float = number(0.0, default=1.0)
+    """s^3: times the integral of the mean squared joint acceleration."""
+    information: float = number(0.0, default=1.0)
+    """Times -log det of the Fisher information."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """Section [weights] of a cost in physical units: times the duration, and times integrals of squares."""
+
+    time: float = number(0.0, default=1.0)
+    """1/s."""
+    base_torque: float = number(0.0, default=1.0)
+    """1/(N^2 m^2 s), of the moment on the base."""
+    base_force: float = number(0.0, default=10.0)
+    """1/(N^2 s), of the force on the base."""
+    joint_torque: float = number(0.0, default=1.0)
+    """1/(N^2 m^2 s)."""
+    end_base: float = number(0.0, default=0.0)
+    """s^2 or s^2/m^2: times the squares of the base's velocity at the end."""
+    end_joints: float = number(0.0, default=0.0)
+    """s^2: times the squares of the joint rates at the end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensors:
+    """Section [sensors]: what the base carries, white noise per sample; no noise given, no such sensor."""
+
+    rate: float = number(1e-3, default=10.0)
+    """Samples per second."""
+    gyro: float | None = number(1e-12, default=None)
+    """rad/s."""
+    accelerometer: float | None = number(1e-12, default=None)
+    """m/s^2, of the specific force."""
+    lever: tuple = vector(3, default=(0.0, 0.0, 0.0))
+    """Place of the accelerometer, base axes [m]."""
+    star_tracker: float | None = number(1e-12, default=None)
+    """rad."""
+
+
+PHASES = {
+    "grasp": ("wait", "approach", "track", "stabilise"),
+    "identify": ("excite",),
+    "reach": ("reach",),
+    "detumble": ("stabilise",),
+}
+SECTIONS = {
+    "grasp": {"robot": Chaser, "target": Passive, "limits": Limits, "tolerance": Tolerance, "weights": Weights},
+    "identify": {"robot": Chaser, "limits": Limits, "sensors": Sensors, "weights": Weights},
+    "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
+    "detumble": {
+        "robot": Chaser,
+        "target": Held,
+        "capture": Capture,
+        "base": Actuators,
+        "end": Rest,
+        "limits": Limits,
+        "weights": Effort,
+    },
+}
