@@ -10,6 +10,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections import Counter
 from contextlib import contextmanager
 
 import harness
@@ -49,16 +50,17 @@ def described(end) -> dict:
     return dict(status=end.status, cost=end.cost, iterations=int(end.iteration), stationarity=end.stationarity)
 
 
-def ours(problem, z) -> dict:
+def ours(problem, z, rounds=ROUNDS) -> dict:
     """The default solver from first guesses, compiled before; the best of some rounds."""
-    sqp.compile_all(problem, len(z))
+    sqp.compile_all(problem)
     runs = []
     with threadpool_limits(1, "blas"):
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             runs.append({})
             with timed(runs[-1]):
-                *_, state = sqp.solve(problem, z, iterations=driver.ITERATIONS)
-                best = sqp.outcome(sqp.pick(state, sqp.ranking(state)[0]))
+                *_, states = sqp.solve(problem, z, iterations=driver.ITERATIONS)
+                best = sqp.outcome(sqp.pick(states, sqp.ranking(states)[0]))
+            runs[-1]["starts"] = dict(Counter(sqp.STATUSES[s.status] for s in states))
     return min(runs, key=lambda run: run["cpu_s"]) | described(best)
 
 
@@ -107,9 +109,11 @@ def starts(name) -> dict:
     task = planners.load(name)
     module = importlib.import_module(f"planners.{task.kind}")
     problem = module.problem(task)
-    z = module.first_guesses(task, problem, SEEDS)
-    one, many = ours(problem, z[:1]), ours(problem, z)
-    return dict(one=one, many=many, seeds=SEEDS, times_longer=round(many["cpu_s"] / one["cpu_s"], 2))
+    guesses = {}
+    with timed(guesses):
+        z = module.first_guesses(task, problem, SEEDS)
+    one, many = ours(problem, z[:1]), ours(problem, z, 1)
+    return dict(one=one, many=many, guesses=guesses, seeds=SEEDS, times_longer=round(many["cpu_s"] / one["cpu_s"], 2))
 
 
 def main(parts):

@@ -7,6 +7,7 @@ quaternions. What is shared: the robot models, `sdyn` itself, and, for the stati
 problem, which is differentiated here by central differences and weighed with the plan's multipliers.
 """
 
+import functools
 import importlib
 import json
 from dataclasses import asdict, dataclass
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
+from planners.problem import ONCE, summary
 
 LIMIT, MOMENTUM, STATIONARITY = 1e-6, 1e-10, 1e-3
 DRIFT = 1e-9  # of momentum within a phase, relative to its largest term
@@ -252,7 +254,7 @@ def see(movers) -> list[Seen]:
     return out
 
 
-@jax.jit
+@functools.partial(jax.jit, **ONCE)
 def _see(chain, q, v, frame):
     def one(q, v):
         pose, twist = sdyn.frame_pose(chain, q, frame), sdyn.frame_velocity(chain, q, v, frame)
@@ -269,14 +271,13 @@ def stationarity(task, plan) -> Row:
     y, u = plan.multipliers["equal"], plan.multipliers["below"]
     z = form.join(plan.variables)
 
-    @jax.jit
-    def lagrangian(z, y, u):
-        value = form.at(z, data)
-        return jnp.stack([value.cost, value.cost + y @ value.equal + u @ value.below]), value.below
+    def lagrangian(z):
+        v = summary(form, z, data)
+        return np.array([v.cost, v.cost + y @ v.equal + u @ v.below]), v.below
 
     steps = DIFFERENCE * np.eye(len(z))
-    slopes = np.array([lagrangian(z + s, y, u)[0] - lagrangian(z - s, y, u)[0] for s in steps]) / (2 * DIFFERENCE)
-    r, slack = slopes[:, 1], np.asarray(lagrangian(z, y, u)[1])
+    slopes = np.array([lagrangian(z + s)[0] - lagrangian(z - s)[0] for s in steps]) / (2 * DIFFERENCE)
+    r, slack = slopes[:, 1], lagrangian(z)[1]
     held = ((z <= low + 1e-6) & (r > 0)) | ((z >= high - 1e-6) & (r < 0))
     worst = max(np.abs(np.where(held, 0.0, r)).max(), np.abs(u * slack).max(initial=0.0), -u.min(initial=0.0))
     return Row("stationarity and complementarity", float(worst / (1 + np.abs(slopes[:, 0]).max())), STATIONARITY, "")

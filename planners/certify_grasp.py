@@ -1,9 +1,11 @@
 """What a plan of a grasp must keep besides limits and dynamics."""
 
+import jax
 import numpy as np
 
 import sdyn
 from planners.certify import DRIFT, INTEGRATION, LIMIT, MOMENTUM, Row, largest, see
+from planners.problem import ONCE
 
 
 def rows(task, plan) -> list[Row]:
@@ -77,11 +79,14 @@ def _momentum(robots, targets):
     ]
 
 
+_jump = jax.jit(sdyn.transfer, **ONCE)
+
+
 def _transfer(plan):
     """The state after the grasp against the momentum-consistent jump of the full systems."""
     before, after = plan.phases[-2], plan.phases[-1]
     body, q, v = before.passive
     chains = sdyn.pack(before.robot), sdyn.pack(body)
-    _, q_new, v_new, _ = sdyn.transfer(chains, sdyn.pack(after.robot), (before.q[-1], q[-1]), (before.v[-1], v[-1]))
+    _, q_new, v_new, _ = _jump(chains, sdyn.pack(after.robot), (before.q[-1], q[-1]), (before.v[-1], v[-1]))
     gap = max(np.abs(np.asarray(q_new) - after.q[0]).max(), np.abs(np.asarray(v_new) - after.v[0]).max())
     return [Row("state after the grasp differs from the jump", float(gap), 10 * INTEGRATION, "m, rad, m/s, rad/s")]

@@ -23,7 +23,7 @@ from planners.bspline import Clamped
 from planners.floating import Motion
 from planners.joints import limit_rows, trapezoid, two_sided, within
 from planners.plan import PhaseResult
-from planners.problem import Block, Form, Problem, Rows, Values
+from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task
 
 FINE = 12  # intervals of the reported effort for one of the solver's
@@ -149,20 +149,17 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """Even braking [count, n], scaled; several differ in duration and from even, and are improved by a descent."""
-    from planners import seeds
-
+    """Even braking [count, n], scaled; several differ in duration and from even."""
     form, (low, high) = problem.form, task.phases["stabilise"].duration
     rng, (_, _, bent) = np.random.default_rng(0), form.blocks
     guesses = [form.join({"duration": np.sqrt(low * high), "end": 0.0, "acceleration": 0.0})]
     for _ in range(count - 1):
         T, away = np.sqrt(low * high) * (high / low) ** rng.uniform(-0.4, 0.4), rng.normal(size=bent.shape)
         guesses.append(form.join({"duration": T, "end": 0.0, "acceleration": away * bent.unit}))
-    z = np.stack(guesses)
-    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+    return np.stack(guesses)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, **ONCE)
 def _detailed(values: Detumble, x, data: Data) -> Motion:
     curve = values.curve(x, data)
     at = jax.vmap(flying.state, (None, 0, 0, 0))(data.chain, *curve)

@@ -3,6 +3,7 @@
 import importlib
 import platform
 import time
+from collections import Counter
 from dataclasses import replace
 from importlib.metadata import version
 
@@ -29,8 +30,8 @@ def plan(
         task: From `planners.load`.
         solver: "sqp"; or "casadi", the referee: the task stated again in CasADi and solved by IPOPT, for a second
             opinion, one first guess after the other.
-        seeds: First guesses, all solved at once; with more than one, each is improved by a descent before. The best
-            result that is certified is kept.
+        seeds: First guesses. The default solver gives each some iterations and goes on with the best few (`sqp.py`);
+            the best result that is certified is kept, and the plan's info says how all ended.
         accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
             balanced if left out. Or a wanted error such as "1e-6": the first of these that is certified and whose
             motion, integrated again by other code, is that close to the plan [m, rad, m/s, rad/s].
@@ -68,7 +69,9 @@ def _planned(task, solver, seeds, accuracy, progress) -> Plan:
         ends, history = SOLVERS[solver](task, problem, z, live)
         live.compiling("the certificate")
         options = {"solver": solver, "seeds": seeds, "accuracy": accuracy, "fine": fine}
-        found = _best(_result(task, problem, module, end, np.array(history), options) for end in ends)
+        info = {"options": options, "starts": dict(Counter(end.status for end in ends))}
+        ends = [end for end in ends if end.status != "dropped"]
+        found = _best(_result(task, problem, module, end, np.array(history), info) for end in ends)
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
     return replace(found, timing=timing)
 
@@ -78,15 +81,15 @@ def _by_sqp(task, problem, z, live) -> tuple[list[Outcome], list]:
     from threadpoolctl import threadpool_limits  # importing it sets an environment variable
 
     live.compiling("the problem and the solver")
-    sqp.compile_all(problem, len(z))
+    sqp.compile_all(problem)
     history = []
     # matrices of a few hundred rows: two threads of BLAS take twice the time of one, and far more on a busy machine
     with threadpool_limits(1, "blas"):
-        for state in sqp.solve(problem, z, iterations=ITERATIONS):
-            best = sqp.pick(state, sqp.ranking(state)[0])
+        for states in sqp.solve(problem, z, iterations=ITERATIONS):
+            best = states[sqp.ranking(states)[0]]
             history.append((len(history), float(best.near.cost), float(best.violation)))
-            live.iteration(*history[-1], float(best.step), sqp.running(state))
-    return [sqp.outcome(sqp.pick(state, k)) for k in sqp.ranking(state)], history
+            live.iteration(*history[-1], float(best.step), sqp.running(states))
+    return [sqp.outcome(sqp.pick(states, k)) for k in sqp.ranking(states)], history
 
 
 def _by_ipopt(task, problem, z, live) -> tuple[list[Outcome], list]:
@@ -141,18 +144,17 @@ def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:
     return tuple(ACCURACIES), wanted
 
 
-def _result(task, problem, module, end: Outcome, history, options):
+def _result(task, problem, module, end: Outcome, history, info):
     x = {name: np.asarray(value) for name, value in problem.form.split(end.z).items()}
-    info = {
+    info = info | {
         "versions": {name: version(name) for name in ("sdyn", "jax", "jaxlib", "numpy", "casadi")}
         | {"python": platform.python_version()},
-        "options": options,
         "sizes": {"variables": len(end.z), "equalities": len(end.y), "inequalities": len(end.u)},
         "cost": end.cost,
         "stationarity": end.stationarity,
         "results": module.results(task, problem, x),
     }
-    phases = module.phases(task, problem.data, x, round(FINE * max(options["fine"], 1.0)))
+    phases = module.phases(task, problem.data, x, round(FINE * max(info["options"]["fine"], 1.0)))
     multipliers = {"equal": end.y, "below": end.u}
     verdict = _verdict(problem, end, x, module, info)
     return Plan(task, phases, end.status, verdict, x, multipliers, history, {}, info)

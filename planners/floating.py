@@ -18,7 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
+from planners.motion import continuous, quaternions
 
+_HAT = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 1, 0)  # hat(x) = _HAT x
+STAGES = np.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]])  # of RK4: time and weight
 SERIES_BELOW = 1e-2  # rad^2; below, five terms of the series of the exponential are exact to the last digit
 
 
@@ -42,13 +45,19 @@ class Momentum(NamedTuple):
 
 def hat(x):
     """Cross-product matrix [3, 3] of x [3]."""
-    o = jnp.zeros_like(x[0])
-    return jnp.array([[o, -x[2], x[1]], [x[2], o, -x[0]], [-x[1], x[0], o]])
+    return jnp.dot(_HAT.astype(x.dtype), x)
 
 
 def cross(a, b):
-    """Cross product, [3]."""
-    return jnp.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    """Cross product, [3]; of few operations, since it is compiled in so many places."""
+    (a1, a2), (b1, b2) = _turned(a), _turned(b)
+    return a1 * b2 - a2 * b1
+
+
+def _turned(x):
+    """Entries (1, 2, 0) and (2, 0, 1)."""
+    twice = jnp.concatenate([x, x])
+    return twice[1:4], twice[2:5]
 
 
 def inverse(S):
@@ -133,29 +142,59 @@ def advance(R, compliance, drive, angular, step):
         angular: L [3], world axes.
         step: Length of the step [s].
     """
+    momentum = R.T @ angular
 
-    def rate(theta, J, g):
-        w = J @ (exponential(-theta) @ (R.T @ angular)) + g
+    def stage(carry, row):  # a loop: it is compiled once, not once a stage
+        k, total = carry
+        (part, weight), J, g = row
+        theta = part * step * k
+        w = J @ (exponential(-theta) @ momentum) + g
         turn = cross(theta, w)
-        return w + turn / 2 + cross(theta, turn) / 12
+        k = w + turn / 2 + cross(theta, turn) / 12
+        return (k, total + weight * k), None
 
-    (J0, J1, J2), (g0, g1, g2) = compliance, drive
-    k1 = J0 @ (R.T @ angular) + g0
-    k2 = rate(step / 2 * k1, J1, g1)
-    k3 = rate(step / 2 * k2, J1, g1)
-    k4 = rate(step * k3, J2, g2)
-    return R @ exponential(step / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    along = lambda x: jnp.stack([x[0], x[1], x[1], x[2]])
+    still = jnp.zeros_like(momentum)
+    rows = STAGES.astype(momentum.dtype), along(compliance), along(drive)
+    (_, mean), _ = jax.lax.scan(stage, (still, still), rows)
+    return R @ exponential(step * mean)
 
 
 def attitudes(R0, compliance, drive, angular, steps):
     """Attitudes [k + 1, 3, 3] along a grid: the arguments of `advance`, for k steps each."""
+    k = len(steps)
+    stages = jnp.concatenate([x.reshape(k, -1) for x in (*compliance, *drive, angular, steps)], axis=1)
+    return _march(R0.ravel(), stages).reshape(k + 1, 3, 3)
 
-    def body(R, stage):
-        R = advance(R, *stage)
+
+def _step(x):
+    """`advance` of its arguments in one row [49], as a row [9]."""
+    R, J, g, angular = x[:9].reshape(3, 3), x[9:36].reshape(3, 3, 3), x[36:45].reshape(3, 3), x[45:48]
+    return advance(R, J, g, angular, x[48]).ravel()
+
+
+@jax.custom_jvp
+def _march(R0, stages):
+    """Attitudes [k + 1, 9] from the first one and the other arguments of each step [k, 40].
+
+    Its derivative is one small Jacobian per step, all made at once, and a loop of matrix products.
+    """
+
+    def step(R, stage):
+        R = _step(jnp.concatenate([R, stage]))
         return R, R
 
-    _, R = jax.lax.scan(body, R0, (compliance, drive, angular, steps))
+    _, R = jax.lax.scan(step, R0, stages)
     return jnp.concatenate([R0[None], R])
+
+
+@_march.defjvp
+def _(primals, tangents):
+    R = _march(*primals)
+    J = jax.vmap(jax.jacfwd(_step))(jnp.concatenate([R[:-1], primals[1]], axis=1))
+    causes = jnp.einsum("kij,kj->ki", J[:, :, 9:], tangents[1])
+    _, changes = jax.lax.scan(lambda d, row: (row[0] @ d + row[1],) * 2, tangents[0], (J[:, :, :9], causes))
+    return R, jnp.concatenate([tangents[0][None], changes])
 
 
 def thirds(x):
@@ -263,9 +302,7 @@ def at_zero_momentum(chain, path, times) -> Motion:
 
 def path_quaternions(R):
     """Unit quaternions [k, 4] along a path of rotations, without jumps of sign."""
-    quat = np.asarray(jax.jit(jax.vmap(quaternion))(jnp.asarray(R)))
-    turn = np.sign(np.sum(quat[1:] * quat[:-1], axis=1))
-    return quat * np.cumprod(np.r_[1.0, turn])[:, None]
+    return continuous(quaternions(np.asarray(R)))
 
 
 class Tumble(NamedTuple):
@@ -290,11 +327,23 @@ def tumble(chain, q, v, horizon, step) -> Tumble:
 
 def tumbled(body: Tumble, time):
     """Attitude [3, 3], position [3] and twist [6] (base axes) of the body at a time, which may be traced."""
-    cell = jnp.clip(jnp.floor(time / body.step).astype(int), 0, len(body.rotations) - 2)
-    J, g = (body.coupling.compliance,) * 3, (jnp.zeros(3),) * 3
-    R = advance(body.rotations[cell], J, g, body.momentum.angular, time - cell * body.step)
+    R = _attitude(body, time)
     p = base_position(body.coupling, R, time, body.momentum)
     return R, p, base_twist(body.coupling, R, jnp.zeros(0), body.momentum)
+
+
+@jax.custom_jvp
+def _attitude(body: Tumble, time):
+    """Attitude of the body, a constant, at a time; its derivative is that of the motion, R hat(w)."""
+    cell = jnp.clip(jnp.floor(time / body.step).astype(int), 0, len(body.rotations) - 2)
+    J, g = (body.coupling.compliance,) * 3, (jnp.zeros(3),) * 3
+    return advance(body.rotations[cell], J, g, body.momentum.angular, time - cell * body.step)
+
+
+@_attitude.defjvp
+def _(primals, tangents):
+    body, R = primals[0], _attitude(*primals)
+    return R, R @ hat(body.coupling.compliance @ (R.T @ body.momentum.angular)) * tangents[1]
 
 
 def initial_momentum(c: Coupling, q, v) -> Momentum:

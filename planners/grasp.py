@@ -21,7 +21,7 @@ from planners.bspline import Clamped
 from planners.floating import Momentum, Motion, Tumble, path_quaternions
 from planners.joints import effort, limit_rows, two_sided, within
 from planners.plan import PhaseResult
-from planners.problem import Block, Form, Problem, Rows, Values
+from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task
 
 MOVING = ("approach", "track", "stabilise")
@@ -221,32 +221,30 @@ def data(task: Task) -> Data:
         ]
     )
     v = np.stack([np.zeros(6), task.target.twist])
-    tumbles = _tumbles(sdyn.family([resting, body]), q, v, horizon)
+    tumbles = jax.tree.map(np.asarray, _tumbles(sdyn.family([resting, body]), q, v, horizon))
     waiting, target = (jax.tree.map(operator.itemgetter(k), tumbles) for k in range(2))
     w = task.weights
     return Data(
         sdyn.family([chaser, task.compound]),
         waiting,
         target,
-        _grip(body, f"target_{task.target.frame}"),
+        _pose(sdyn.pack(body), body.neutral(), f"target_{task.target.frame}"),
         jnp.asarray(task.start),
-        jnp.clip(jnp.asarray(task.position_limits), -1e3, 1e3),
+        np.clip(task.position_limits, -1e3, 1e3),
         jnp.asarray(task.rate_limits),
         jnp.asarray(task.torque_limits),
         jnp.asarray(task.limits.margin),
         jnp.asarray(task.tolerance.speed),
-        jnp.array([w.time, w.torque, w.smoothness]),
+        np.array([w.time, w.torque, w.smoothness]),
     )
 
 
-@functools.partial(jax.jit, static_argnums=3)
+@functools.partial(jax.jit, static_argnums=3, **ONCE)
 def _tumbles(chains, q, v, horizon):
     return jax.vmap(lambda chain, q, v: floating.tumble(chain, q, v, horizon, TABLE_STEP))(chains, q, v)
 
 
-def _grip(body, frame):
-    """Pose of a frame in the base of a rigid robot."""
-    return tuple(map(jnp.asarray, sdyn.frame_pose(sdyn.pack(body), body.neutral(), frame)))
+_pose = jax.jit(sdyn.frame_pose, static_argnums=2, **ONCE)
 
 
 def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
@@ -254,26 +252,29 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
     grid = Grid.of(task, fine)
     motions = _detailed(grid, x, data)
     waiting = np.linspace(0.0, x["durations"][0], fine + 1)
-    chaser, target = (_states(tumble, waiting) for tumble in (data.waiting, data.target))
+    times = waiting, *(np.asarray(at.times) for at in motions[:2])
+    chaser, target = (_states(tumble, np.concatenate(times)) for tumble in (data.waiting, data.target))
+    cut = np.cumsum([len(t) for t in times])[:-1]
+    targets = [(task.body, *state) for state in zip(*(np.split(x, cut) for x in target), strict=True)]
+    passive = dict(zip(task.phases, targets, strict=False))  # all but the last
     n, free = len(task.joints), lambda tau: np.hstack([np.zeros((len(tau), 6)), tau])
     still = np.tile(task.start, (len(waiting), 1)), np.zeros((len(waiting), n))
-    state = [np.hstack([part, more]) for part, more in zip(chaser, still, strict=True)]
-    out = [PhaseResult("wait", task.chaser, waiting, *state, free(0 * still[0]), (task.body, *target))]
+    state = [np.hstack([part[: len(waiting)], more]) for part, more in zip(chaser, still, strict=True)]
+    out = [PhaseResult("wait", task.chaser, waiting, *state, free(0 * still[0]), passive["wait"])]
     for name, at in zip(MOVING, motions, strict=True):
         at = jax.tree.map(np.asarray, at)
         q = np.hstack([at.p, path_quaternions(at.R), at.q])
-        passive = None if name == "stabilise" else (task.body, *_states(data.target, at.times))
-        robot = task.compound if name == "stabilise" else task.chaser
-        out.append(PhaseResult(name, robot, at.times, q, at.v, free(at.tau), passive))
+        robot = task.chaser if name in passive else task.compound
+        out.append(PhaseResult(name, robot, at.times, q, at.v, free(at.tau), passive.get(name)))
     return tuple(out)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, **ONCE)
 def _detailed(grid, x, data):
     return motion(grid, x, data)
 
 
-@jax.jit
+@functools.partial(jax.jit, **ONCE)
 def _tumbled(body, times):
     return jax.vmap(floating.tumbled, (None, 0))(body, times)
 
@@ -309,12 +310,11 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """First guesses [count, n], scaled; several are improved by a descent."""
+    """First guesses [count, n], scaled."""
     from planners import seeds
 
     form = problem.form
-    z = np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, count)])
-    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+    return np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, count)])
 
 
 def results(task: Task, problem: Problem, x: dict) -> dict:

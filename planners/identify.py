@@ -25,7 +25,8 @@ from planners.bspline import Clamped
 from planners.floating import Motion
 from planners.joints import effort, limit_rows, trapezoid, within
 from planners.plan import PhaseResult
-from planners.problem import Block, Form, Problem, Rows, Values
+from planners.problem import ONCE, Block, Form, Problem, Rows, Values, summary
+from planners.sqp import PENALTIES, merit
 from planners.task import Task
 
 PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -136,7 +137,7 @@ def _with_base(chain, index, phi):
     return sdyn.with_params(chain, new)
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@functools.partial(jax.jit, static_argnums=1, **ONCE)
 def _slopes(chain, index, phi, q):
     at = lambda phi: sdyn.mass_matrix(_with_base(chain, index, phi), floating.at_rest(q))[:6, :6]
     return jnp.moveaxis(jax.jacfwd(at)(phi), -1, 0)
@@ -150,9 +151,9 @@ def data(task: Task) -> Data:
     weight = lambda noise: 0.0 if noise is None else np.sqrt(s.rate) / noise
     return Data(
         chain,
-        _slopes(chain, base, jnp.asarray(phi), jnp.asarray(task.start)) * size[:, None, None],
+        np.asarray(_slopes(chain, base, phi, task.start)) * size[:, None, None],
         jnp.asarray(task.start),
-        jnp.clip(jnp.asarray(task.position_limits), -1e3, 1e3),
+        np.clip(task.position_limits, -1e3, 1e3),
         jnp.asarray(task.rate_limits),
         jnp.asarray(task.torque_limits),
         jnp.asarray(task.limits.margin),
@@ -180,9 +181,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """The best of some smooth random motions [count, n], scaled; several are improved by a descent."""
-    from planners import seeds
-
+    """The best of some smooth random motions [count, n], scaled."""
     rng, form = np.random.default_rng(0), problem.form
     shape = form.blocks[1].shape
     knots = np.linspace(0, 1, shape[0])[:, None]
@@ -193,12 +192,11 @@ def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
         swing = 0.12 * waves * task.rate_limits * high
         inside = np.clip(task.start + swing, 0.9 * task.position_limits[:, 0], 0.9 * task.position_limits[:, 1])
         guesses.append(form.join({"duration": [(low + high) / 2], "excite": inside}))
-    z = np.stack(guesses)
-    z = z[np.argsort(seeds.merits(form, z, problem.numbers), kind="stable")[:count]]
-    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+    merits = [merit(summary(form, z, problem.data), PENALTIES[0]) for z in guesses]
+    return np.stack(guesses)[np.argsort(merits, kind="stable")[:count]]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)
 def _detailed(spline, intervals, x, data):
     return motion(spline, intervals, x, data)
 

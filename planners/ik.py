@@ -60,9 +60,8 @@ def inverse_kinematics(
     low, high = (-jnp.inf, jnp.inf) if limits is None else jnp.moveaxis(jnp.asarray(limits), -1, 0)
     mass_centre = sdyn.centre_of_mass(chain, q) if floats else None
 
-    def body(carry):
-        best, s = carry
-        e, J, follow = _linear(chain, frame, goal, s.q, nb, floats)
+    def body(carry):  # at first nothing is known and nothing moves, so that what a posture says is compiled once
+        best, s, (e, J, follow) = carry
         dq = _damped(J, e)
         inside = jnp.clip(s.q[nb:] + dq, low, high) - s.q[nb:]
         dq = _damped(J * (inside != 0), e)
@@ -71,18 +70,19 @@ def inverse_kinematics(
         base = s.q[:nb]
         if floats:
             base = _carried(chain, base, follow @ (joints - s.q[nb:]), joints, mass_centre)
-        new = found(jnp.concatenate([base, joints]), s.iterations + 1)
+        q = jnp.concatenate([base, joints])
+        there = look(q)
+        left = jnp.linalg.norm(there[0])
+        new = Posture(q, left, jnp.where(left <= tolerance, 0, 1), s.iterations + 1)
         better = new.error < best.error
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best), new
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best), new, there
 
-    def found(q, count):
-        left = jnp.linalg.norm(_error(chain, frame, goal, q))
-        return Posture(q, left, jnp.where(left <= tolerance, 0, 1), count)
-
+    look = lambda q: _linear(chain, frame, goal, q, nb, floats)
     q = jnp.concatenate([q[:nb], jnp.clip(q[nb:], low, high)])
-    start = found(q, jnp.asarray(0))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(look, q))
+    start = Posture(q, jnp.asarray(jnp.inf, q.dtype), jnp.asarray(1), jnp.asarray(-1))
     goes_on = lambda carry: (carry[1].status == 1) & (carry[1].iterations < iterations)
-    best, now = jax.lax.while_loop(goes_on, body, (start, start))
+    best, now, _ = jax.lax.while_loop(goes_on, body, (start, start, nothing))
     return best._replace(iterations=now.iterations)
 
 

@@ -6,6 +6,7 @@ Variables and rows are scaled: z = x / scale of its block, and a row is its phys
 so that 1 is a large violation everywhere. `Rows` carries names, units and scales back to the reader.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -13,6 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+ONCE = dict(compiler_options={"xla_backend_optimization_level": 0})  # of programs that run for less than they compile
 
 
 class Values(NamedTuple):
@@ -27,6 +30,14 @@ class Values(NamedTuple):
     def cost(self):
         """The cost, []."""
         return self.smooth + self.residual @ self.residual / 2
+
+
+class Summary(NamedTuple):
+    """What a solver must know of one point."""
+
+    cost: np.ndarray  # []
+    equal: np.ndarray  # [e]
+    below: np.ndarray  # [i]
 
 
 class Linear(NamedTuple):
@@ -52,7 +63,7 @@ class Outcome(NamedTuple):
     u: np.ndarray  # [i] multipliers of the inequalities
     stationarity: float  # of the Lagrangian, relative to 1 + |gradient of the cost|
     iteration: int
-    status: str  # solved, infeasible or not converged
+    status: str  # solved, infeasible, not converged, or dropped for better starts
 
     @property
     def violation(self) -> float:
@@ -144,6 +155,17 @@ class Form:
             v.below,
             J.below,
         )
+
+
+def summary(form: Form, z, data) -> Summary:
+    """The problem at z (scaled), as arrays of the host; compiled once for all who ask."""
+    return Summary(*map(np.asarray, _summary(form, z, data)))
+
+
+@functools.partial(jax.jit, static_argnums=0, **ONCE)
+def _summary(form, z, data):
+    v = form.at(z, data)
+    return v.cost, v.equal, v.below
 
 
 @dataclass(frozen=True, eq=False)

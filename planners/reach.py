@@ -20,7 +20,7 @@ from planners.floating import Motion
 from planners.ik import inverse_kinematics
 from planners.joints import effort, limit_rows, within
 from planners.plan import PhaseResult
-from planners.problem import Block, Form, Problem, Rows, Values
+from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task
 
 POSTURES, SPREAD = 8, 0.6  # from which inverse kinematics starts, and how far they are from the start [rad]
@@ -143,7 +143,7 @@ def postures(task: Task, numbers: Data, count: int = POSTURES) -> tuple[np.ndarr
     return tuple(map(np.asarray, found))
 
 
-@functools.partial(jax.jit, static_argnums=1)
+@functools.partial(jax.jit, static_argnums=1, **ONCE)
 def _reached(numbers: Data, oriented: bool, starts):
     goal = numbers.goal[0] if oriented else None, numbers.goal[1]
     centre = lambda q: sdyn.centre_of_mass(numbers.chain, floating.at_rest(q))
@@ -171,14 +171,11 @@ def least(numbers: Data, q) -> tuple[float, float]:
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """First guesses [count, n], scaled: straight to the postures that cost least; several are improved by a descent."""
-    from planners import seeds
-
-    numbers, form = problem.data, problem.form
+    """First guesses [count, n], scaled: straight to the postures that cost least."""
+    numbers = problem.data
     q, miss = postures(task, numbers, max(count, POSTURES))
     order = np.lexsort(([least(numbers, x)[1] for x in q], np.round(miss, 6)))
-    z = np.stack([guess(problem, x) for x in q[order[:count]]])
-    return z if count == 1 else seeds.improve(form, z, problem.numbers)
+    return np.stack([guess(problem, x) for x in q[order[:count]]])
 
 
 def guess(problem: Problem, q) -> np.ndarray:
@@ -189,7 +186,7 @@ def guess(problem: Problem, q) -> np.ndarray:
     return problem.form.join({"duration": [T], "reach": (1 - s) * np.asarray(numbers.q0) + s * q, "end": q})
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)
 def _detailed(spline, intervals, x, data):
     return motion(spline, intervals, x, data)
 

@@ -1,24 +1,20 @@
-"""First guesses for the grasp: inverse kinematics at many times and from many postures, improved by optax."""
+"""First guesses for the grasp: inverse kinematics at many times and from many postures."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from planners import floating, grasp
 from planners.ik import inverse_kinematics
-from planners.problem import Form
-from planners.sqp import merit
+from planners.problem import ONCE
 from planners.task import Task
 
 TIMES, POSTURES = 12, 8  # candidates of the grasp's time, and random postures for each
-PENALTY = 30.0  # of the l1 violation while optax improves a guess
-DESCENT = (150, 3e-3)  # steps and rate of Adam
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, **ONCE)
 def reach(frame: str, data: grasp.Data, times, q):
     """Joints that bring the hand to the grasp at times [k], from postures q [k, n], with the base as while waiting.
 
@@ -74,30 +70,3 @@ def _guess(task, grid, time, tracking, approach, before, q):
         s = np.array([spline.knots[j + 1 : j + 1 + spline.degree].mean() for j in range(3, spline.count - 3)])[:, None]
         x[name] = stops[k] * (1 - s) + stops[k + 1] * s
     return x
-
-
-@functools.partial(jax.jit, static_argnums=0)
-@functools.partial(jax.vmap, in_axes=(None, 0, None))
-def _descend(form: Form, z, numbers):
-    data, lower, upper = numbers
-    adam = optax.adam(optax.cosine_decay_schedule(DESCENT[1], DESCENT[0]))
-    slope = jax.grad(lambda z: merit(form, z, data, PENALTY)[0])
-
-    def step(carry, _):
-        z, state = carry
-        move, state = adam.update(slope(z), state)
-        return (jnp.clip(z + move, lower, upper), state), None
-
-    (z, _), _ = jax.lax.scan(step, (z, adam.init(z)), None, length=DESCENT[0])
-    return z
-
-
-def improve(form: Form, z, numbers):
-    """Guesses [seeds, n] (scaled) after a descent on the cost with an l1 penalty."""
-    return np.asarray(_descend(form, z, numbers))
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def merits(form: Form, z, numbers):
-    """Merits [seeds] of guesses [seeds, n] (scaled): cost and l1 penalty."""
-    return jax.lax.map(lambda z: merit(form, z, numbers[0], PENALTY)[0], z)

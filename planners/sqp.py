@@ -1,12 +1,14 @@
-"""Dense sequential quadratic programming with an l1 merit function and a trust region, for several starts at once.
+"""Dense sequential quadratic programming with an l1 merit function and a trust region, from one start or several.
 
 Each iteration solves one elastic programme (`qp`) in a box around the point. The curvature is Gauss-Newton plus a
 symmetric rank-one correction that learns, from short steps, what Gauss-Newton leaves out (the constraints'
 curvature); negative directions are mirrored. A step that does not pay is first bent (second-order correction), then
 shortened. The penalty grows only where the linearised constraints gain by it.
 
-The functions below are for one start and are vmapped over all of them: a start that has ended waits, unchanged. The
-loop runs on the host, so that it can be watched; three compiled functions do the work.
+The loop runs on the host, so that it can be watched; three compiled functions do the work, for one start, so that one
+start and many share them. Several starts take turns, one iteration each. After TRIAL iterations they are compared by
+the merit, all with the first penalty: the KEPT best of those that still run go on, the others are dropped. Only if none
+that went on is solved, the best of those are taken up again. What has ended before is neither compared nor dropped.
 Source: Fletcher's S l1 QP; Nocedal and Wright, Numerical Optimization, chapters 6 and 18; Byrd, Nocedal and Waltz
 (2008), Steering exact penalty methods.
 """
@@ -18,9 +20,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from planners import qp
-from planners.problem import Form, Linear, Outcome, Problem
+from planners.problem import Form, Linear, Outcome, Problem, summary
 
 FEASIBLE = 1e-9  # scaled violation
 STATIONARY = 1e-6  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
@@ -35,12 +38,13 @@ STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more p
 IDLE = 2  # iterations without progress after which more penalty is tried anyway
 PATIENCE = 8  # iterations without progress
 STALLED = 12  # iterations in which neither the violation falls by a hundredth nor the penalty grows: infeasible
-STATUSES = ("running", "solved", "infeasible", "not converged")
-RUNNING, SOLVED, INFEASIBLE, UNCONVERGED = range(4)
+TRIAL, KEPT = 10, 4  # iterations of each of several starts, and how many go on: by then costs are near their minima
+STATUSES = ("running", "solved", "infeasible", "not converged", "dropped")
+RUNNING, SOLVED, INFEASIBLE, UNCONVERGED, DROPPED = range(5)
 
 
 class State(NamedTuple):
-    """Where the solver is; of several starts, all arrays have a leading axis."""
+    """Where the solver is, from one start."""
 
     z: jax.Array  # [n]
     near: Linear  # the problem at z
@@ -86,13 +90,6 @@ def violation(equal, below):
     return jnp.abs(equal).sum() + below.sum(), qp.max_abs((equal, below))
 
 
-def merit(form: Form, z, data, penalty):
-    """Cost with the l1 penalty, infinite where it is not finite, and the equalities."""
-    v = form.at(z, data)
-    total = v.cost + penalty * violation(v.equal, v.below)[0]
-    return jnp.where(jnp.isfinite(total), total, jnp.inf), v.equal
-
-
 def direction(s: State, low, high, penalty) -> Step:
     """The step of the quadratic programme in the trust region."""
     near = s.near
@@ -109,35 +106,46 @@ def direction(s: State, low, high, penalty) -> Step:
 
 
 def search(form: Form, s: State, step: Step, numbers) -> Found:
-    """Tries the step at each of LENGTHS, straight and then bent, until one pays."""
+    """Tries the step at each of LENGTHS, straight and then bent, until one pays; on the host."""
     data, low, high = numbers
-    A, lengths = s.near.A, jnp.asarray(LENGTHS)
+    z, d, A, equal = (np.asarray(x) for x in (s.z, step.d, s.near.A, s.near.equal))
+    now, predicted, penalty, factors = float(step.now), float(step.predicted), float(step.penalty), None
+
+    def gained(there):
+        v = summary(form, there, data)
+        gain = now - merit(v, penalty)
+        return gain if np.isfinite(gain) else -np.inf, v.equal
+
+    for length in LENGTHS:
+        least, there = WORTH * length * predicted - NOISE * abs(now), z + length * d
+        gain, left = gained(there)
+        if gain <= least and len(A) and np.isfinite(left).all():
+            factors = factors or _normal(A)
+            there = np.clip(there - A.T @ cho_solve(factors, left - (1 - length) * equal), low, high)
+            gain, _ = gained(there)
+        if gain > least:
+            return Found(there, np.float64(length), np.float64(gain))
+    return Found(z, np.float64(0), np.float64(0))
+
+
+def _normal(A):
+    """Cholesky factors of A A^T."""
     gram = A @ A.T
-    gram = gram + 1e-12 * jnp.maximum(jnp.trace(gram), 1e-200) * jnp.eye(len(A))
-    factors = jax.scipy.linalg.cho_factor(gram)
+    return cho_factor(gram + 1e-12 * max(np.trace(gram), 1e-200) * np.eye(len(A)))
 
-    def attempt(carry):
-        trial, _, _, unseen = carry
-        length, bent = lengths[trial // 2], trial % 2
-        z = s.z + length * step.d
-        z = jnp.where(bent, jnp.clip(z - A.T @ jax.scipy.linalg.cho_solve(factors, unseen), low, high), z)
-        value, equal = merit(form, z, data, step.penalty)
-        return trial + 1, z, step.now - value, equal - (1 - length) * s.near.equal
 
-    def goes_on(carry):
-        trial, _, gain, _ = carry
-        pays = gain > WORTH * lengths[jnp.maximum(trial - 1, 0) // 2] * step.predicted - NOISE * jnp.abs(step.now)
-        return (trial < 2 * len(LENGTHS)) & ~((trial > 0) & pays)
+def total_violation(v) -> float:
+    """Sum of the violations of a summary or a linear model, on the host."""
+    return float(np.abs(v.equal).sum() + np.maximum(v.below, 0.0).sum())
 
-    carry = jnp.asarray(0), s.z, jnp.zeros_like(step.now), jnp.zeros_like(s.near.equal)
-    trial, z, gain, _ = jax.lax.while_loop(goes_on, attempt, carry)
-    length = lengths[(trial - 1) // 2]
-    pays = gain > WORTH * length * step.predicted - NOISE * jnp.abs(step.now)
-    return Found(jnp.where(pays, z, s.z), jnp.where(pays, length, 0.0), jnp.where(pays, gain, 0.0))
+
+def merit(v, penalty: float) -> float:
+    """Cost of a summary or a linear model, with an l1 penalty; on the host."""
+    return float(v.cost) + penalty * total_violation(v)
 
 
 def arrive(form: Form, s: State, step: Step, found: Found, numbers) -> State:
-    """The state at the point that was found; a state that has ended stays."""
+    """The state at the point that was found."""
     data, low, high = numbers
     z, length, gain = found
     near = form.near(z, data)
@@ -166,8 +174,7 @@ def arrive(form: Form, s: State, step: Step, found: Found, numbers) -> State:
         s.iteration + 1,
         s.status,
     )
-    new = new._replace(status=status(new))
-    return jax.tree.map(lambda a, b: jnp.where(s.status == RUNNING, a, b), new, s)
+    return new._replace(status=status(new))
 
 
 def learn(S, old: Linear, new: Linear, step, y, u):
@@ -192,33 +199,33 @@ def status(s: State):
     feasible = s.violation <= FEASIBLE
     ended = jnp.where(feasible, jnp.where(s.stationarity <= ENOUGH, SOLVED, UNCONVERGED), INFEASIBLE)
     more = (s.idle < PATIENCE) & (feasible | (s.stalled < STALLED))
-    return jnp.where(feasible & (s.stationarity <= STATIONARY), SOLVED, jnp.where(more, RUNNING, ended))
+    ended = jnp.where(more, RUNNING, ended)
+    return jnp.where(feasible & (s.stationarity <= STATIONARY), SOLVED, ended).astype(s.status.dtype)
 
 
-_direction = jax.jit(jax.vmap(direction, (0, None, None, 0)))
-_search = jax.jit(jax.vmap(search, (None, 0, 0, None)), static_argnums=0)
-_arrive = jax.jit(jax.vmap(arrive, (None, 0, 0, 0, None)), static_argnums=0)
+_direction = jax.jit(direction)
+_arrive = jax.jit(arrive, static_argnums=0)
 
 
 def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
-    """What `_arrive` takes to the state at first guesses z [s, n]: no step, from nowhere."""
-    s, n = z.shape
+    """What `_arrive` takes to the state at a first guess z [n]: no step, from nowhere."""
+    n = len(z)
     e, i = (sum(rows.size for rows in groups) for groups in (problem.equal, problem.below))
-    zero, count, full = np.zeros, np.zeros(s, int), lambda x: np.full(s, x)
-    near = Linear(zero(s), zero((s, n)), zero((s, n, n)), zero((s, e)), zero((s, e, n)), zero((s, i)), zero((s, i, n)))
-    reals = full(0.3), full(PENALTIES[0]), zero(s), zero(s), zero(s), full(np.inf)
-    state = State(z, near, near.equal, near.below, near.curvature, *reals, count - 1, count, count - 1, count)
-    step = Step(0 * z, near.equal, near.below, full(PENALTIES[0]), *zero((4, s)))
-    return state, step, Found(z, full(1.0), zero(s))
+    zero, real, count = np.zeros, np.float64, np.int64
+    near = Linear(real(0), zero(n), zero((n, n)), zero(e), zero((e, n)), zero(i), zero((i, n)))
+    reals = real(0.3), real(PENALTIES[0]), real(0), real(0), real(0), real(np.inf)
+    state = State(z, near, near.equal, near.below, near.curvature, *reals, count(-1), count(0), count(-1), count(0))
+    step = Step(0 * z, near.equal, near.below, real(PENALTIES[0]), *zero(4))
+    return state, step, Found(z, real(1), real(0))
 
 
-def compile_all(problem: Problem, count: int) -> None:
-    """Compiles what `solve` calls for `count` starts, side by side."""
-    _, low, high = numbers = problem.numbers
-    state, step, found = _blank(problem, np.zeros((count, len(low))))
+def compile_all(problem: Problem) -> None:
+    """Compiles what `solve` calls, side by side."""
+    data, low, high = numbers = problem.numbers
+    state, step, found = _blank(problem, np.zeros(len(low)))
     jobs = (
         (_arrive, problem.form, state, step, found, numbers),
-        (_search, problem.form, state, step, numbers),
+        (summary, problem.form, state.z, data),
         (_direction, state, low, high, step.penalty),
     )
     with ThreadPoolExecutor(len(jobs)) as pool:
@@ -226,60 +233,78 @@ def compile_all(problem: Problem, count: int) -> None:
             jax.block_until_ready(job.result())
 
 
-def solve(problem: Problem, z, *, iterations: int = 200) -> Iterator[State]:
-    """Iterates from first guesses; the last state says how each ended.
+def solve(problem: Problem, z, *, iterations: int = 200) -> Iterator[list[State]]:
+    """Iterates from first guesses; the last states say how each ended.
 
     Args:
         problem: What is to be solved.
         z: First guesses [starts, n], scaled.
-        iterations: At most.
+        iterations: At most, of each.
+
+    Returns:
+        After each iteration, the states of all starts, in the order of the guesses.
     """
     form, numbers = problem.form, problem.numbers
     _, low, high = numbers
-    state, step, found = _blank(problem, np.clip(z, low, high))
-    state = _arrive(form, state, step, found, numbers)
-    for _ in range(iterations):
-        yield state
-        if not running(state):
+    states = [_arrive(form, *_blank(problem, start), numbers) for start in np.clip(z, low, high)]
+    while True:
+        states = _compared([_marked(s, UNCONVERGED) if _runs(s) and s.iteration >= iterations else s for s in states])
+        yield states
+        if not running(states):
             return
-        step = _steered(state, low, high)
-        state = _arrive(form, state, step, _search(form, state, step, numbers), numbers)
-    yield state._replace(status=np.where(np.asarray(state.status) == RUNNING, UNCONVERGED, state.status))
+        states = [_iterated(form, s, numbers) if _runs(s) else s for s in states]
 
 
-def _steered(state, low, high) -> Step:
+def _runs(s: State) -> bool:
+    return bool(s.status == RUNNING)
+
+
+def _marked(s: State, status) -> State:
+    return s._replace(status=np.int64(status))
+
+
+def _iterated(form, s: State, numbers) -> State:
+    """The state after one iteration."""
+    step = _steered(s, *numbers[1:])
+    return _arrive(form, s, step, search(form, s, step, numbers), numbers)
+
+
+def _compared(states) -> list[State]:
+    """The states, the worst of those that ran for TRIAL iterations dropped; or taken up again where none is solved."""
+    if not running(states) and not any(s.status == SOLVED for s in states):
+        states = [_marked(s, RUNNING) if s.status == DROPPED else s for s in states]
+    merits = {k: merit(s.near, PENALTIES[0]) for k, s in enumerate(states) if _runs(s) and s.iteration == TRIAL}
+    worst = sorted(merits, key=merits.get)[KEPT:]
+    return [_marked(s, DROPPED) if k in worst else s for k, s in enumerate(states)]
+
+
+def _steered(s: State, low, high) -> Step:
     """The step, with ten times the penalty where that leaves clearly less violation, or where nothing else helps.
 
     A trust region that is too small for feasible linearised constraints is no reason for a larger penalty.
     """
-    step = _direction(state, low, high, state.penalty)
-    before = np.asarray(jax.vmap(violation)(state.near.equal, state.near.below)[0])
-    left, penalty = np.asarray(step.left), np.asarray(step.penalty)
-    stuck = (np.asarray(step.most) > FEASIBLE) & (left > STEER[0] * before) & (penalty < PENALTIES[1])
-    stuck &= np.asarray(state.status) == RUNNING
-    if not stuck.any():
+    step, before = _direction(s, low, high, s.penalty), total_violation(s.near)
+    left, penalty = float(step.left), float(step.penalty)
+    if float(step.most) <= FEASIBLE or left <= STEER[0] * before or penalty >= PENALTIES[1]:
         return step
-    harder = _direction(state, low, high, np.where(stuck, 10 * penalty, penalty))
-    better = (np.asarray(harder.left) < left - STEER[1] * before) | (np.asarray(state.idle) >= IDLE)
-    choose = lambda a, b: np.where((stuck & better).reshape(-1, *(1,) * (np.ndim(a) - 1)), a, b)
-    return jax.tree.map(choose, harder, step)
+    harder = _direction(s, low, high, np.float64(10 * penalty))
+    return harder if float(harder.left) < left - STEER[1] * before or s.idle >= IDLE else step
 
 
-def ranking(state: State) -> np.ndarray:
+def ranking(states) -> np.ndarray:
     """Starts from the best to the worst: how they ended, then the cost with the largest penalty."""
-    total = jax.vmap(violation)(state.near.equal, state.near.below)[0]
-    merits = np.asarray(state.near.cost + PENALTIES[1] * total)
-    return np.lexsort((merits, np.asarray(state.status) != SOLVED))
+    merits = [merit(s.near, PENALTIES[1]) for s in states]
+    return np.lexsort((merits, [(s.status != SOLVED) + (s.status == DROPPED) for s in states]))
 
 
-def running(state: State) -> int:
+def running(states) -> int:
     """Number of starts that have not ended."""
-    return int((np.asarray(state.status) == RUNNING).sum())
+    return sum(map(_runs, states))
 
 
-def pick(state: State, k: int) -> State:
-    """The state of one start."""
-    return jax.tree.map(lambda a: np.asarray(a[k]), state)
+def pick(states, k: int) -> State:
+    """The state of one start, as numbers of the host."""
+    return jax.tree.map(np.asarray, states[k])
 
 
 def outcome(state: State) -> Outcome:
