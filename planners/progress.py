@@ -22,7 +22,7 @@ class Live:
 
     Args:
         title: What is being solved.
-        seeds: Number of starting points that are improved at once.
+        seeds: Number of starting points.
         show: False prints nothing at all.
         iterations: Largest number of iterations; it bounds the estimate of the time left.
         tolerance: Feasibility at which the solver stops; with it the time left is extrapolated.
@@ -112,7 +112,7 @@ class Live:
         if len(self._pace) < 3:
             return "-"
         (k0, t0, f0), (k1, t1, f1) = self._pace[0], self._pace[-1]
-        most = (t1 - t0) / (k1 - k0) * (self.limit - k1) if self.limit else math.inf
+        most = (t1 - t0) / (k1 - k0) * max(self.limit - k1, 0) if self.limit else math.inf
         if self.tolerance and self.tolerance < f1 < f0:
             guess = (t1 - t0) * math.log(f1 / self.tolerance) / math.log(f0 / f1)
             return duration(min(guess, most))

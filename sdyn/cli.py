@@ -85,7 +85,7 @@ def plan(
         task: A shipped task (grasp, grasp_planar, identify, reach, detumble), or the path of a .toml file.
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
         solver: sqp, or casadi for a second opinion: the task stated again in CasADi and solved by IPOPT.
-        seeds: How many starting points to improve and solve at once; the best certified result is kept.
+        seeds: How many starting points to try; the worst are dropped early, the best certified result is kept.
         accuracy: How fine the solver's grid is: fast (half of the task's intervals), balanced, accurate (twice) or
             reference (four times); or a wanted error such as 1e-6, for the first of these that delivers it.
     """
