@@ -15,7 +15,7 @@ COLOURS = {
     "RK4, drifting": "#444444", "RK4, link frame": "#0b3c6f", "RK4, float32, link frame": "#9fd3ef",
 }  # fmt: skip
 ADVICE = (
-    ("a quick look, thousands of motions at once", "fast: float32, 1e-4 to 1e-5 where steps are short for the motion"),
+    ("a quick look, thousands of motions at once", "fast: float32, 1e-5 to 1e-6 where steps are short for the motion"),
     ("planning, control, most things", "balanced: RK4 in float64, one step for each of yours"),
     ("a result to be believed", "accurate: eight steps for each of yours, about 1e-3 to 1e-4 of the error"),
     ("a reference for the others", "reference: order 8, adaptive; cheapest of all below about 1e-8"),

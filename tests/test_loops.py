@@ -141,3 +141,18 @@ def test_float32():
     assert vdot.dtype == lam.dtype == np.float32 and (status.rank == 9).all()
     close(vdot, want[0], 2e-5)  # 1.9e-6
     close(lam, want[1], 2e-5)  # 1.5e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", oracles.TREES)
+def test_float32_of_grapples(name):
+    """Jump, impulse and accelerations of a robot that grasps the ground, from the state that float32 holds."""
+    _, (free, tied, _) = grapples()[name]
+    data = oracles.tree(f"{name}_grapple")
+    q, v = sdyn.pad(free, data["q"], data["nu_before"])
+    state = [np.asarray(x, np.float32) for x in (q, v, sdyn.pad(free, data["q"], data["tau"])[1], data["gravity"])]
+    *_, v1, impulse, vdot, lam, status, _, _ = GRAPPLE(*sdyn.PRESETS["fast"].cast((free, tied)), *state)
+    want = GRAPPLE(free, tied, *(np.asarray(x, float) for x in state))[2:6]
+    assert vdot.dtype == np.float32 and (status.rank == 6).all()
+    for found, exact in zip((v1, impulse, vdot, lam), want, strict=True):
+        close(found, exact, 5e-5)  # 2e-5 at most

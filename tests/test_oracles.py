@@ -242,6 +242,25 @@ def test_single_precision(name, end):
         meets(block(name, bias), data["bias_g1"], 5e-6)  # 3e-7
 
 
+@pytest.mark.parametrize("name", TREES)
+def test_single_precision_of_locked_joints(name):
+    """The same with every lock of the data."""
+    data, file = oracles.tree(f"{name}_locked"), oracles.tree(f"{name}_states")
+    for k, mask in enumerate(data["locked_mask"]):
+        q, keep = file["q"][k], np.r_[np.ones(6, bool), ~mask]
+        variant = robot(name).lock({f"j{i}": q[7 + i] for i in np.flatnonzero(mask)})
+        chain = sdyn.pack(variant, capacity())
+        still = np.zeros((len(mask) + 1, 6)), np.zeros(int(keep.sum()))
+        exact = State(q[np.r_[True, keep]], data["nu"][k][keep], file["tau"][k][keep], GRAVITY, *still)
+        x = [np.tile(y, (STATES, *(1,) * y.ndim)) for y in padded(variant, chain, exact)]
+        chain, x = sdyn.PRESETS["fast"].cast((chain, x))
+        vdot, M, bias = (y[:1] for y in run(FAST, chain, *x[:5]))
+        at, m = real(variant), int(keep.sum())
+        meets(vdot[:, at], data["nudot_full_g1"][k : k + 1, keep], 5e-6)  # 4e-7 at most
+        meets(M[:, at][:, :, at], data["M_reduced_padded"][k : k + 1, :m, :m], 5e-6)
+        meets(bias[:, at], data["bias_reduced_padded_g1"][k : k + 1, :m], 5e-6)
+
+
 # -- composites by hand ------------------------------------------------------------------------------------------------
 
 

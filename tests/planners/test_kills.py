@@ -1,4 +1,4 @@
-"""`sdyn plan`, killed by the system while it writes: the folder holds the plan of before or the new one, never none."""
+"""`sdyn plan`, killed by the system: the folder holds the plan of before or the new one, never none, never a half."""
 
 import os
 import signal
@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import planners
@@ -63,3 +64,38 @@ def test_five_kills_while_a_plan_is_written(tmp_path, rng):
     print(f"\n{ends}, a run writes for {seconds:.1f} s")  # noqa: T201
     whole("the end")
     assert planners.Plan.load(folder).verdict == "the end" and not (folder / ".new").exists()
+
+
+@pytest.mark.slow
+def test_five_kills_of_the_whole_command(tmp_path, rng):
+    """One in each fifth of its time, into an empty folder: no plan is there then, or the whole one; the compilations
+    that were kept stay good.
+    """
+    command = [sys.executable, "-m", "sdyn", "plan", "grasp", "--out"]
+    rest = dict(cwd=ROOT, env=os.environ | {"SDYN_CACHE": str(tmp_path / "cache")}, stdout=subprocess.DEVNULL)
+
+    def whole(name):
+        began = time.monotonic()
+        assert subprocess.run([*command, tmp_path / name], **rest, check=False).returncode == 0
+        return time.monotonic() - began, planners.Plan.load(tmp_path / name)
+
+    _, wanted = whole("first")
+    seconds, _ = whole("again")
+    ends = []
+    for k in range(5):
+        folder = tmp_path / f"killed {k}"
+        process = subprocess.Popen([*command, folder], **rest)
+        time.sleep((k + rng.uniform()) / 5 * seconds)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        ends.append((folder / "plan.json").exists() or (folder / ".new").exists())
+        if ends[-1]:
+            assert same(planners.Plan.load(folder), wanted)
+        else:
+            assert not folder.exists()
+    print(f"\nplans there: {ends}, a run takes {seconds:.1f} s")  # noqa: T201
+    assert not all(ends) and same(whole("killed 0")[1], wanted)
+
+
+def same(one, other):
+    return all(np.array_equal(one.variables[key], other.variables[key]) for key in other.variables)
