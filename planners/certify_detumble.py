@@ -7,8 +7,9 @@ from scipy.integrate import cumulative_simpson
 import sdyn
 from planners.certify import Row, largest, see
 from planners.motion import rotations
+from planners.problem import ONCE
 
-BALANCE = 1e-6  # of momentum and energy, relative to their largest terms; by Simpson's rule on the plan's grid
+BALANCE = 1e-6  # of momentum and energy, relative to their largest terms; by Simpson's rule, whole pairs of intervals
 
 
 def rows(task, plan) -> list[Row]:
@@ -33,7 +34,7 @@ def _momentum(seen, phase):
     turn = lambda x: np.einsum("kij,kj->ki", rotations(phase.q[:, 3:7]), x)
     moment, force = turn(phase.tau[:, :3]), turn(phase.tau[:, 3:6])
     wrench = np.hstack([moment + np.cross(phase.q[:, :3], force), force])
-    miss = largest(total - total[0] - cumulative_simpson(wrench, x=phase.times, axis=0, initial=0))
+    miss = largest((total - total[0] - cumulative_simpson(wrench, x=phase.times, axis=0, initial=0))[::2])
     scale = largest(seen.parts)
     return [
         Row(f"{name} momentum that no force gave, relative", float(part), BALANCE, "")
@@ -41,11 +42,11 @@ def _momentum(seen, phase):
     ]
 
 
-_energies = jax.jit(jax.vmap(sdyn.kinetic_energy, (None, 0, 0)))
+_energies = jax.jit(jax.vmap(sdyn.kinetic_energy, (None, 0, 0)), **ONCE)
 
 
 def _energy(phase) -> float:
     """Change of kinetic energy against the work of all that acts, relative to the largest energy."""
     energy = np.asarray(_energies(sdyn.pack(phase.robot), phase.q, phase.v))
     work = cumulative_simpson(np.sum(phase.tau * phase.v, axis=1), x=phase.times, initial=0)
-    return float(np.abs(energy - energy[0] - work).max() / max(energy.max(), np.finfo(float).tiny))
+    return float(np.abs(energy - energy[0] - work)[::2].max() / max(energy.max(), np.finfo(float).tiny))

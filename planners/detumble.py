@@ -1,10 +1,10 @@
 """A chaser and what it has grasped come to rest, by joints, thrusters and reaction wheels, as a problem.
 
 A quintic spline holds the centre of mass, the base's attitude and the joints. Variables: the duration, the rates at
-the end, and how each coordinate's acceleration differs from even braking. Velocities at the end are zero but for a
-tolerance, and but for reaction wheels. What acts on the base and on the joints follows from inverse dynamics, and is
-kept in a box. The cost is the integral of 1 and of the squares of what acts, and the squares of the velocities at the
-end, weighted.
+the end, and what further efforts would do in the posture of the start, besides even braking: the curvature of the cost
+is then about diagonal. Velocities at the end are zero but for a tolerance, and but for reaction wheels. What acts on
+the base and on the joints follows from inverse dynamics, and is kept in a box. The cost is the integral of 1 and of the
+squares of what acts, and the squares of the velocities at the end, weighted.
 
 Source: Vyas et al. (2022), Post-capture detumble trajectory stabilization for robotic active debris removal (the cost).
 """
@@ -33,8 +33,7 @@ class Data(NamedTuple):
     """Numbers of one task; all traced."""
 
     chain: sdyn.Chain  # the compound
-    start: jax.Array  # [6 + n] centre of mass, rotation vector, joints
-    speed: jax.Array  # [6 + n] their rates at the start
+    start: flying.Start
     position: jax.Array  # [n, 2] limits
     rate: jax.Array  # [n]
     torque: jax.Array  # [n]
@@ -57,8 +56,8 @@ class Detumble:
     def control_points(self, x, data: Data):
         """Control points [count, 6 + n] from the variables by name."""
         T, (braking, bent) = x["duration"][0], self.spline.between
-        ends = jnp.stack([data.start, T * data.speed, T * x["end"]])
-        return braking @ ends + T**2 * bent @ x["acceleration"].T
+        ends = jnp.stack([data.start.x, T * data.start.rate, T * x["end"]])
+        return braking @ ends + T**2 * bent @ (data.start.reply @ x["efforts"]).T
 
     def curve(self, x, data: Data):
         """The coordinates and their first two derivatives by time at the grid's points, [k + 1, 6 + n] each."""
@@ -93,16 +92,12 @@ def rows(task: Task, values: Detumble) -> tuple[Rows, ...]:
     return *limit_rows(task, count, count - 1, points), *wrench, turn, end
 
 
-@jax.jit
-def _start(chain, q, v):
-    """Coordinates, their rates, and the mass matrix at the start."""
-    return *flying.coordinates(chain, q, v), sdyn.mass_matrix(chain, q)
+_start = jax.jit(flying.start, **ONCE)
 
 
 def data(task: Task) -> Data:
     """The numbers of a task."""
     w, chain = task.weights, sdyn.pack(task.compound)
-    start, speed, _ = _start(chain, task.first, task.captured)
     numbers = (
         np.clip(task.position_limits, -1e3, 1e3),
         task.rate_limits,
@@ -114,7 +109,7 @@ def data(task: Task) -> Data:
         np.repeat([w.base_torque, w.base_force, w.joint_torque], [3, 3, len(task.joints)]),
         np.r_[[w.end_base] * 6, [w.end_joints * (joint.name not in task.base.wheels) for joint in task.joints]],
     )
-    return Data(chain, start, speed, *map(jnp.asarray, numbers))
+    return Data(chain, _start(chain, task.first, task.captured), *map(jnp.asarray, numbers))
 
 
 def _shape(task, fine) -> Detumble:
@@ -123,39 +118,39 @@ def _shape(task, fine) -> Detumble:
     return Detumble(Clamped(phase.control_points), max(4, round(phase.intervals * fine)), tuple(resting))
 
 
-def _scales(task) -> tuple[tuple, tuple]:
-    """Rates at the end, and accelerations that the limit of each coordinate's own actuator gives it alone: the next
-    powers of ten, so that slightly other limits compile nothing.
+def _scales(task, numbers) -> tuple[tuple, tuple]:
+    """Rates at the end, and efforts that cost about 1 or reach a limit: the next powers of ten, so that slightly other
+    numbers compile nothing.
     """
-    *_, M = _start(sdyn.pack(task.compound), task.first, task.captured)
-    turn, _, joints = np.split(np.diag(np.linalg.inv(M)), [3, 6])
-    torque, force = np.split(task.base_limits, 2)
-    accelerations = np.r_[force / M[3, 3], torque * turn, task.torque_limits * joints]
-    wheel = np.r_[np.zeros(6, bool), [joint.name in task.base.wheels for joint in task.joints]]
-    rates = np.where(wheel, np.r_[np.zeros(6), task.rate_limits], task.end.speed)
-    return tuple(tuple((10.0 ** np.round(np.log10(x))).tolist()) for x in (rates, accelerations))
+    duration, limits = np.sqrt(np.prod(task.phases["stabilise"].duration)), np.r_[task.base_limits, task.torque_limits]
+    efforts = (2 * duration * np.asarray(numbers.weights) + limits**-2.0) ** -0.5
+    wheels = [6 + k for k, joint in enumerate(task.joints) if joint.name in task.base.wheels]
+    rates = np.full(len(limits), task.end.speed)
+    rates[wheels] = (duration * efforts * np.diag(numbers.start.reply))[wheels]
+    return tuple(tuple((10.0 ** np.round(np.log10(x))).tolist()) for x in (rates, efforts))
 
 
 def problem(task: Task, fine: float = 1.0) -> Problem:
     """The problem of a task, its grid multiplied by `fine`."""
-    values, (low, high) = _shape(task, fine), task.phases["stabilise"].duration
-    rates, accelerations = _scales(task)
+    values, numbers = _shape(task, fine), data(task)
+    low, high = task.phases["stabilise"].duration
+    rates, efforts = _scales(task, numbers)
     blocks = (
         Block("duration", (1,), 10.0),
         Block("end", (len(rates),), rates),
-        Block("acceleration", (len(rates), values.spline.count - 3), accelerations),
+        Block("efforts", (len(rates), values.spline.count - 3), efforts),
     )
-    return Problem(Form(blocks, values), data(task), {"duration": low}, {"duration": high}, (), rows(task, values))
+    return Problem(Form(blocks, values), numbers, {"duration": low}, {"duration": high}, (), rows(task, values))
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     """Even braking [count, n], scaled; several differ in duration and from even."""
     form, (low, high) = problem.form, task.phases["stabilise"].duration
     rng, (_, _, bent) = np.random.default_rng(0), form.blocks
-    guesses = [form.join({"duration": np.sqrt(low * high), "end": 0.0, "acceleration": 0.0})]
+    guesses = [form.join({"duration": np.sqrt(low * high), "end": 0.0, "efforts": 0.0})]
     for _ in range(count - 1):
         T, away = np.sqrt(low * high) * (high / low) ** rng.uniform(-0.4, 0.4), rng.normal(size=bent.shape)
-        guesses.append(form.join({"duration": T, "end": 0.0, "acceleration": away * bent.unit}))
+        guesses.append(form.join({"duration": T, "end": 0.0, "efforts": away * bent.unit}))
     return np.stack(guesses)
 
 

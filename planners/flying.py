@@ -51,11 +51,25 @@ def _axial(A):
     return jnp.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]]) / 2
 
 
-def coordinates(chain, q, v):
-    """The point x [6 + n] and its rate of a state whose base is at the world's origin, in its axes."""
-    c = floating.coupling(sdyn.mass_matrix(chain, q))
-    linear = v[3:6] + floating.cross(v[:3], c.centre) + c.linear @ v[6:] / c.mass
-    return jnp.concatenate([c.centre, jnp.zeros(3), q[7:]]), jnp.concatenate([linear, v[:3], v[6:]])
+class Start(NamedTuple):
+    """Where a curve starts, with the base at the world's origin, in its axes."""
+
+    x: jax.Array  # [6 + n]
+    rate: jax.Array  # [6 + n]
+    reply: jax.Array  # [6 + n, 6 + n] accelerations of the coordinates per unit of what acts, at rest
+
+
+def start(chain, q, v) -> Start:
+    """The start of a curve from the state there, q [nq] and v [6 + n]."""
+    M = sdyn.mass_matrix(chain, q)
+    c = floating.coupling(M)
+
+    def rate(v):
+        linear = v[3:6] + floating.cross(v[:3], c.centre) + c.linear @ v[6:] / c.mass
+        return jnp.concatenate([linear, v[:3], v[6:]])
+
+    reply = jax.vmap(rate, 1, 1)(jnp.linalg.inv(M))
+    return Start(jnp.concatenate([c.centre, jnp.zeros(3), q[7:]]), rate(v), reply)
 
 
 @floating.locally

@@ -48,8 +48,8 @@ def programme(task, problem, z) -> Programme:
     tree, n, K = symbolic.tree_of(sdyn.pack(task.compound)), len(task.joints), values.intervals + 1
     T, s = nlp.x["duration"][0], np.linspace(0, 1, K)
     braking, bent = map(matrix, values.spline.between)
-    start, speed = (ca.DM(np.asarray(x)).T for x in (data.start, data.speed))
-    P = braking @ ca.vertcat(start, T * speed, T * nlp.x["end"].T) + T**2 * bent @ nlp.x["acceleration"].T
+    x, rate, reply = (ca.DM(np.asarray(x)) for x in data.start)
+    P = braking @ ca.vertcat(x.T, T * rate.T, T * nlp.x["end"].T) + T**2 * bent @ (reply @ nlp.x["efforts"]).T
     splines = [(matrix(values.spline.basis(s, order)) @ P).T for order in range(3)]
     path = [nlp.variable(nlp.value(x / T**order).full()) for order, x in enumerate(splines)]
     for order, (x, wanted) in enumerate(zip(path, splines, strict=True)):

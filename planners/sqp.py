@@ -37,7 +37,9 @@ RADII = (1e-6, 0.1, 2.0)  # trust region, scaled variables: smallest, at least a
 STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more penalty, one gained is worth it
 IDLE = 2  # iterations without progress after which more penalty is tried anyway
 PATIENCE = 8  # iterations without progress
-STALLED = 12  # iterations in which neither the violation falls by a hundredth nor the penalty grows: infeasible
+# Iterations in which neither the violation falls by a hundredth, nor the merit by more than the violation counts in it,
+# nor the penalty grows: infeasible.
+STALLED = 12
 TRIAL, KEPT = 10, 4  # iterations of each of several starts, and how many go on: by then costs are near their minima
 STATUSES = ("running", "solved", "infeasible", "not converged", "dropped")
 RUNNING, SOLVED, INFEASIBLE, UNCONVERGED, DROPPED = range(5)
@@ -56,7 +58,7 @@ class State(NamedTuple):
     violation: jax.Array  # [] the largest one, scaled
     stationarity: jax.Array  # []
     step: jax.Array  # [] largest entry of the last step
-    least: jax.Array  # [] total violation when it last fell by a hundredth
+    least: jax.Array  # [] total violation when it last fell by a hundredth, or did not matter
     idle: jax.Array  # [] iterations in a row without progress
     stalled: jax.Array  # [] iterations since then
     iteration: jax.Array  # []
@@ -154,7 +156,7 @@ def arrive(form: Form, s: State, step: Step, found: Found, numbers) -> State:
     shorter = jnp.where(length > 0, 2 * length, LENGTHS[-1]) * size
     after, most = violation(near.equal, near.below)
     raised = step.penalty > s.penalty
-    falls = (after < 0.99 * s.least) | raised
+    falls = (after < 0.99 * s.least) | (gain > step.penalty * after) | raised
     radius = jnp.where(length == 1, wider, shorter)
     radius = jnp.where(raised, jnp.maximum(radius, RADII[1]), radius)
     new = State(

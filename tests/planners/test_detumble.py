@@ -65,7 +65,7 @@ def test_the_velocities_at_the_start_come_from_the_generalised_jacobian(task, ch
     twist = -np.linalg.solve(M[:6, :6], np.r_[np.zeros(3), M[3:6, 6:] @ rates])
     start = np.r_[twist, rates]
     assert np.abs(start - task.captured).max() < 1e-12
-    assert np.abs(start[PLANE] - PUBLISHED["start"]).max() < 1e-9  # measured 2e-11
+    assert np.abs(start[PLANE] - PUBLISHED["start"]).max() < 1e-9  # measured 5e-13
     assert np.abs(M[3:6] @ start).max() < 1e-14
 
 
@@ -83,8 +83,8 @@ def test_values_are_those_of_the_referee(task):
     at = np.concatenate([programme.value(x).full().ravel() for x in rows])
     below = np.stack([at - np.concatenate(high), np.concatenate(low) - at], axis=1).ravel()
     assert sum(rows.size for rows in problem.below) == len(below) == len(value.below)
-    assert np.abs(value.below - below).max() < 1e-10  # measured
-    assert abs(value.cost / float(programme.value(programme.cost)) - 1) < 1e-12
+    assert np.abs(value.below - below).max() < 1e-10  # measured 9e-13
+    assert abs(value.cost / float(programme.value(programme.cost)) - 1) < 1e-12  # measured 1e-13
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_it_comes_to_rest_and_is_certified(judged):
     assert judged.certificate.passed, str(judged.certificate)
     assert judged.certificate.worst("speed at the end") <= 1e-3
     assert judged.certificate.active == ("the torque limit of joint1",)
-    assert sum(judged.info["results"]["cost_parts"].values()) < PUBLISHED["cost"]  # measured 8.392, and 8.544
+    assert sum(judged.info["results"]["cost_parts"].values()) < PUBLISHED["cost"]  # measured 8.400, and 8.544
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,22 @@ def test_sqp_names_the_constraint_that_cannot_hold():
     assert all(x[1] < 1e-6 for x in rest)
 
 
+def around_a_corner(x, data):
+    """The highest point of a disc that is far wider than the trust region, from its side along the edge."""
+    x = x["x"]
+    return Values(-x[1], jnp.zeros(1), jnp.zeros(0), (x @ x / data - data)[None] / 2)
+
+
+def test_a_step_that_brings_more_than_its_violation_costs_is_progress():
+    """Every iterate but the first leaves the disc by as much, until the top is near: no reason to give up."""
+    radius = 40.0
+    problem = Problem(Form((Block("x", (2,)),), around_a_corner), radius, {}, {}, (), (Rows("disc", 1.0, "", (1,)),))
+    *_, state = sqp.solve(problem, np.array([[radius, 0.0]]))
+    end = sqp.outcome(sqp.pick(state, 0))
+    assert end.status == "solved" and end.iteration > 2 * sqp.STALLED  # measured 64
+    assert np.abs(end.z - [0.0, radius]).max() < 1e-6  # measured 1.9e-11
+
+
 def test_the_same_solve_twice_is_identical():
     assert np.array_equal(last(problem_71(), [1, 5, 5, 1]).z, last(problem_71(), [1, 5, 5, 1]).z)
 
