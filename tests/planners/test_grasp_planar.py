@@ -82,4 +82,4 @@ def test_several_seeds_find_no_worse_plan_than_one(name):
     assert found.status == "solved" and found.certificate.passed, found.verdict
     starts = found.info["starts"]
     assert found.info["options"]["seeds"] == sum(starts.values()) == 12 and starts["dropped"] > 0
-    assert found.info["cost"] < one.info["cost"] * (1 + 1e-6)  # GRASP
+    assert found.info["cost"] < one.info["cost"] * (1 + 1e-6)  # 1.2382 both; 0.9215 and 0.9903
