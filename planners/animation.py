@@ -6,7 +6,6 @@ without a server, so one listens on the local machine while the file is made; it
 
 import contextlib
 import html
-import io
 import re
 from pathlib import Path
 
@@ -78,14 +77,26 @@ def _server():
     """A viser server that only this machine can reach, started and stopped without a word."""
     import viser  # takes a second
 
-    silence = lambda: contextlib.redirect_stdout(io.StringIO())
-    with silence():
+    with _silence():
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         yield server
     finally:
-        with silence():
+        with _silence():
             server.stop()
+
+
+@contextlib.contextmanager
+def _silence():
+    """Nothing on rich's console, through which viser speaks in terminals and in notebooks."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _page(plan) -> str:
