@@ -11,5 +11,6 @@ from planners.compare import Table, compare
 from planners.driver import plan
 from planners.ik import Posture, inverse_kinematics
 from planners.plan import PhaseResult, Plan, PlanError
+from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study
 from planners.task import Task, TaskError, load

@@ -1,19 +1,23 @@
 """What all tasks ask of the joints: their limits, as rows of a problem, and what their effort costs."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from planners.problem import Rows
 from planners.task import Task
 
 
-def limit_rows(task: Task, positions: int, rates: int, torques: int) -> tuple[Rows, ...]:
-    """Names of the rows of joint limits, for so many points of each."""
-    names = [j.name for j in task.joints]
-    return (
-        *(Rows(f"position limit of {n}", 1.0, "rad", (positions, 2)) for n in names),
-        *(Rows(f"rate limit of {n}", x, "rad/s", (rates, 2)) for n, x in zip(names, task.rate_limits, strict=True)),
-        *(Rows(f"torque limit of {n}", x, "N m", (torques, 2)) for n, x in zip(names, task.torque_limits, strict=True)),
-    )
+def limit_rows(task: Task, positions: int, rates: int, torques: int, room: int = 0) -> tuple[Rows, ...]:
+    """Names of the rows of joint limits, for so many points of each, and for the room for further joints."""
+    names, out = [j.name for j in task.joints], []
+    for what, scales, unit, count in (
+        ("position", np.ones(len(names)), "rad", positions),
+        ("rate", task.rate_limits, "rad/s", rates),
+        ("torque", task.torque_limits, "N m", torques),
+    ):
+        out += [Rows(f"{what} limit of {n}", x, unit, (count, 2)) for n, x in zip(names, scales, strict=True)]
+        out += [Rows(f"{what} limit of no joint", 1.0, unit, (room, count, 2))] * (room > 0)
+    return tuple(out)
 
 
 def within(data, points, rates, torques):

@@ -19,11 +19,13 @@ from planners.bspline import Clamped
 from planners.floating import Motion
 from planners.ik import inverse_kinematics
 from planners.joints import effort, limit_rows, within
+from planners.motion import rotations
 from planners.plan import PhaseResult
 from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task
 
 POSTURES, SPREAD = 8, 0.6  # from which inverse kinematics starts, and how far they are from the start [rad]
+GOLDEN, SECTIONS = (5**0.5 - 1) / 2, 60
 
 
 class Data(NamedTuple):
@@ -98,15 +100,15 @@ def data(task: Task, chain: sdyn.Chain | None = None) -> Data:
     room = lambda x, fill: np.concatenate([x, np.full((n - len(x), *x.shape[1:]), fill)])
     return Data(
         chain,
-        jnp.asarray(chain.capacity.frame_names.index(task.robot.frame)),
-        (floating.rotation(jnp.asarray(goal.quaternion or (1.0, 0, 0, 0))), jnp.asarray(goal.position)),
-        jnp.asarray(room(task.start, 0.0)),
-        jnp.asarray(room(np.clip(task.position_limits, -1e3, 1e3), [-1e3, 1e3])),
-        jnp.asarray(room(task.rate_limits, 1.0)),
-        jnp.asarray(room(task.torque_limits, 1.0)),
-        jnp.asarray(task.limits.margin),
-        jnp.asarray(task.phases["reach"].duration),
-        jnp.array([w.time, w.torque, w.smoothness]),
+        np.asarray(chain.capacity.frame_names.index(task.robot.frame)),
+        (rotations(np.array([goal.quaternion or (1.0, 0, 0, 0)]))[0], np.array(goal.position)),
+        room(task.start, 0.0),
+        room(np.clip(task.position_limits, -1e3, 1e3), [-1e3, 1e3]),
+        room(task.rate_limits, 1.0),
+        room(task.torque_limits, 1.0),
+        np.asarray(task.limits.margin),
+        np.array(task.phases["reach"].duration),
+        np.array([w.time, w.torque, w.smoothness]),
     )
 
 
@@ -128,62 +130,83 @@ def problem(task: Task, fine: float = 1.0, numbers: Data | None = None) -> Probl
     equal = (Rows(f"place of {frame!r} at the end", 1.0, "m", (3,)),)
     if task.goal.quaternion is not None:
         equal += (Rows(f"orientation of {frame!r} at the end", 1.0, "rad", (3,)),)
-    below = limit_rows(task, spline.count, spline.count - 1, intervals + 1)
+    below = limit_rows(task, spline.count, spline.count - 1, intervals + 1, n - len(task.joints))
     return Problem(form, numbers, {"duration": low}, {"duration": high}, equal, below)
 
 
-def postures(task: Task, numbers: Data, count: int = POSTURES) -> tuple[np.ndarray, np.ndarray]:
-    """Joints at the goal [count, n] by inverse kinematics, from the start and from random postures about it, and the
-    errors that are left [count] (m, rad). Those of the start come first; they are often the nearest.
-    """
+class Postures(NamedTuple):
+    """Joints at the goal, as inverse kinematics finds them, and what it costs at least to go there."""
+
+    q: np.ndarray  # [k, n]
+    error: np.ndarray  # [k] what is left of the way to the goal, m and rad
+    duration: np.ndarray  # [k] s
+    cost: np.ndarray  # [k]
+
+    @property
+    def best(self) -> int:
+        """The cheapest of those at the goal, or of those that come closest."""
+        return int(np.lexsort((self.cost, np.round(self.error, 6)))[0])
+
+
+def postures(task: Task, numbers: Data, count: int = POSTURES) -> Postures:
+    """Postures from the start, first, and from random ones about it."""
     noise = np.random.default_rng(0).normal(size=(count, len(task.joints)))
     noise[0] = 0.0
-    starts = np.asarray(numbers.q0) + SPREAD * np.pad(noise, ((0, 0), (0, len(numbers.q0) - len(task.joints))))
-    found = _reached(numbers, task.goal.quaternion is not None, np.clip(starts, *numbers.position.T))
-    return tuple(map(np.asarray, found))
+    starts = numbers.q0 + SPREAD * np.pad(noise, ((0, 0), (0, len(numbers.q0) - len(task.joints))))
+    found = _postures(numbers, task.goal.quaternion is not None, np.clip(starts, *numbers.position.T))
+    return Postures(*map(np.asarray, found))
 
 
 @functools.partial(jax.jit, static_argnums=1, **ONCE)
-def _reached(numbers: Data, oriented: bool, starts):
+def _postures(numbers: Data, oriented: bool, starts) -> Postures:
     goal = numbers.goal[0] if oriented else None, numbers.goal[1]
     centre = lambda q: sdyn.centre_of_mass(numbers.chain, floating.at_rest(q))
 
     def one(q):
         start = floating.at_rest(q).at[:3].set(centre(numbers.q0) - centre(q))
         found = inverse_kinematics(numbers.chain, numbers.frame, goal, start, limits=numbers.position, floats=True)
-        return found.q[7:], found.error
+        return Postures(found.q[7:], found.error, *least(numbers, found.q[7:]))
 
     return jax.vmap(one)(starts)
 
 
-def least(numbers: Data, q) -> tuple[float, float]:
-    """Duration and cost that no motion to joints q can undercut: rest to rest, without torque or dynamics.
+def least(data: Data, q):
+    """Duration and cost that no motion to joints q undercuts: rest to rest within the rates, no torque, no dynamics.
 
-    A joint that goes as far as d in the time T has at least 12 d^2 / T^3 as the integral of its squared acceleration.
+    A joint that goes as far as d in the time T at rates up to v has at least this integral of its squared acceleration:
+    12 d^2 / T^3 if T >= 1.5 d / v, else 16 v^2 / (9 (T - d / v)). The sum is convex in T.
     """
-    far = np.abs(q - np.asarray(numbers.q0))
-    low, high = np.asarray(numbers.duration)
-    time, _, smoothness = np.asarray(numbers.weights)
-    square = 12 * smoothness * np.mean(far**2)
-    best = (3 * square / time) ** 0.25 if time > 0 else high
-    T = np.clip(best, max(low, (far / np.asarray(numbers.rate)).max()), max(low, high))
-    return float(T), float(time * T + square / T**3)
+    far, (time, _, smoothness) = jnp.abs(q - data.q0), data.weights
+    fastest, (low, high) = far / data.rate, data.duration
+
+    def cost(T):
+        late = 16 * data.rate**2 / (9 * jnp.maximum(T - fastest, 1e-30))
+        squares = jnp.where(T >= 1.5 * fastest, 12 * far**2 / T**3, late)
+        return time * T + smoothness * squares.mean()
+
+    def section(_, ends):
+        a, b = ends
+        c, d = b - GOLDEN * (b - a), a + GOLDEN * (b - a)
+        left = cost(c) < cost(d)
+        return jnp.where(left, a, c), jnp.where(left, d, b)
+
+    a, b = jax.lax.fori_loop(0, SECTIONS, section, (jnp.clip(fastest.max(), low, high), high))
+    return (a + b) / 2, cost((a + b) / 2)
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     """First guesses [count, n], scaled: straight to the postures that cost least."""
-    numbers = problem.data
-    q, miss = postures(task, numbers, max(count, POSTURES))
-    order = np.lexsort(([least(numbers, x)[1] for x in q], np.round(miss, 6)))
-    return np.stack([guess(problem, x) for x in q[order[:count]]])
+    found = postures(task, problem.data, max(count, POSTURES))
+    order = np.lexsort((found.cost, np.round(found.error, 6)))[:count]
+    return np.stack([guess(problem, found.q[k], found.duration[k]) for k in order])
 
 
-def guess(problem: Problem, q) -> np.ndarray:
-    """The straight motion to joints q, as slow as its rates ask for: variables [n], scaled."""
+def guess(problem: Problem, q, duration) -> np.ndarray:
+    """The straight motion to joints q in about that duration, longer where rates ask for it: variables [n], scaled."""
     numbers, inner = problem.data, problem.form.values.spline.count - 6
-    T = np.clip(max(least(numbers, q)[0], 2 * (np.abs(q - numbers.q0) / numbers.rate).max()), *numbers.duration)
+    T = np.clip(max(duration, 2 * (np.abs(q - numbers.q0) / numbers.rate).max()), *numbers.duration)
     s = np.linspace(0, 1, inner + 2)[1:-1, None]
-    return problem.form.join({"duration": [T], "reach": (1 - s) * np.asarray(numbers.q0) + s * q, "end": q})
+    return problem.form.join({"duration": [T], "reach": (1 - s) * numbers.q0 + s * q, "end": q})
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)

@@ -34,6 +34,7 @@ WORTH = 0.1  # part of the predicted decrease that a step must bring
 NOISE = 1e-10  # relative change of the merit that says nothing: steps within it are taken, or the radius would collapse
 LEARN_BELOW = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
 RADII = (1e-6, 0.1, 2.0)  # trust region, scaled variables: smallest, at least after a larger penalty, largest
+WIDE = 1e3  # scaled: a trust region that is none
 STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more penalty, one gained is worth it
 IDLE = 2  # iterations without progress after which more penalty is tried anyway
 PATIENCE = 8  # iterations without progress
@@ -291,6 +292,12 @@ def _steered(s: State, low, high) -> Step:
         return step
     harder = _direction(s, low, high, np.float64(10 * penalty))
     return harder if float(harder.left) < left - STEER[1] * before or s.idle >= IDLE else step
+
+
+def forecast(s: State, low, high) -> float:
+    """The least merit of the quadratic model about a state, wherever it is within the bounds."""
+    step = _direction(s._replace(radius=np.float64(WIDE)), low, high, s.penalty)
+    return float(step.now) - float(step.predicted)
 
 
 def ranking(states) -> np.ndarray:

@@ -1,0 +1,185 @@
+"""The choice of a structure: bounds that hold, one compilation, and the best of all."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from structures import QUICKLY
+
+import planners
+import sdyn
+from planners import reach, sqp
+from planners.problem import Linear
+from planners.structures import REACHED, _bounds, _toml, dual_bound, variant
+from planners.task import parse
+
+TEXT = """
+kind = "reach"
+[robot]
+model = "planar3"
+joints = { joint1 = -0.9, joint2 = 1.5, joint3 = 0.5 }
+[goal]
+position = [1.0, 0.3, 0.0]
+[phases.reach]
+duration = [2.0, 30.0]
+control_points = 8
+intervals = 12
+[limits]
+torque = 4.0
+[weights]
+time = 0.02
+smoothness = 20.0
+"""
+TASK = parse(TEXT, "planar")
+
+
+def large(*arms):
+    """Arms of the 37-DOF robot, and a goal that the first may reach."""
+    moving = ", ".join(f'"arm{a}_{k}"' for a in arms for k in range(1, 8))
+    bent = ", ".join(f"arm{a}_2 = 0.8, arm{a}_4 = -1.2" for a in arms)
+    text = TEXT.replace('"planar3"', f'"paper37"\nframe = "hand1"\nmoving = [{moving}]')
+    text = text.replace("joint1 = -0.9, joint2 = 1.5, joint3 = 0.5", bent).replace("[limits]", "[limits]\nrate = 0.4")
+    return parse(text.replace("[1.0, 0.3, 0.0]", "[1.2, 0.2, 1.3]"), "large")
+
+
+COMPILED = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **rest: COMPILED.append(event) if event.endswith("backend_compile_duration") else None
+)
+
+
+def test_every_way_to_lock_some_joints():
+    found = planners.lockings(TASK, 2)
+    assert len(found) == len(set(found)) == 1 + 3 + 3 and {x.frame for x in found} == {"hand"}
+    found = planners.lockings(large(1, 2))
+    assert [x.frame for x in found] == ["hand1"] * 8 + ["hand2"] * 8
+    assert all(name.startswith("arm" + x.frame[-1]) for x in found for name in x.joints)
+
+
+@pytest.mark.parametrize("name", ["reach", "grasp", "identify"])
+def test_a_task_that_is_written_again_says_the_same(name):
+    task = planners.load(name)
+    again = parse(_toml(tomllib.loads(task.source)), name)
+    for key in ("robot", "phases", "limits", "weights", "goal", "target", "sensors", "tolerance"):
+        assert getattr(again, key) == getattr(task, key)
+
+
+def test_a_variant_is_the_task_that_its_text_says():
+    task = variant(TASK, planners.Structure("hand", ("joint1", "joint3")))
+    again = parse(task.source, "planar")
+    assert again.robot == task.robot and repr(again.chaser) == repr(task.chaser)
+    assert [j.name for j in task.joints] == ["joint1", "joint3"] and task.chaser.locked["joint2"][0] == 1.5
+
+
+def test_room_for_more_joints_changes_nothing():
+    """The same motion in a capacity with room for one more joint: base, torques and goal, and the cost by its mean."""
+    small = variant(TASK, planners.Structure("hand", ("joint1", "joint3")))
+    roomy = sdyn.pack(small.chaser, sdyn.capacity([small.chaser, TASK.chaser]))
+    values = jax.jit(lambda z, data, form: form.at(z, data), static_argnums=2, **QUICKLY)
+    found = []
+    for data in (reach.data(small), reach.data(small, roomy)):
+        problem = reach.problem(small, 1.0, data)
+        end = np.pad([0.4, -0.6], (0, len(data.q0) - 2)) + data.q0
+        v = values(reach.guess(problem, end, 8.0), data, problem.form)
+        assert len(v.below) == sum(rows.size for rows in problem.below)
+        found.append((v.equal, np.asarray(v.residual) ** 2, v.smooth))
+    (equal, squares, smooth), (equal_2, squares_2, smooth_2) = found
+    assert np.abs(equal - equal_2).max() < 1e-14 and smooth == smooth_2
+    squares_2 = 1.5 * squares_2.reshape(2, -1, 3)
+    assert (squares_2[..., 2] == 0).all()
+    assert np.abs(squares_2[..., :2] - squares.reshape(2, -1, 2)).max() < 1e-14 * squares.max()
+
+
+def test_a_bound_is_that_of_the_cheapest_posture_of_any_part():
+    """Postures that miss the goal do not count."""
+    names = planners.Structure("a", ("x", "y")), planners.Structure("a", ("x",)), planners.Structure("b", ("x",))
+    one = lambda cost, error=0.0: reach.Postures(np.zeros((1, 2)), np.array([error]), np.ones(1), np.array([cost]))
+    assert np.array_equal(_bounds(names, [one(3.0), one(2.0), one(1.0)]), [2.0, 2.0, 1.0])
+    assert np.array_equal(_bounds(names, [one(3.0), one(2.0, 2 * REACHED), one(1.0)]), [3.0, np.inf, 1.0])
+
+
+def test_the_dual_bound_of_a_convex_programme_is_below_its_minimum(rng):
+    """And is the minimum with the right multipliers; some variables are held by their bounds."""
+    n, e = 6, 2
+    H, A, g, a = rng.normal(size=(n, n)), rng.normal(size=(e, n)), rng.normal(size=n), rng.normal(size=e)
+    H = H @ H.T + np.eye(n)
+    low, high = np.r_[-np.inf, np.full(n - 1, -9.0)], np.full(n, 9.0)
+    K = np.block([[H, A.T], [A, np.zeros((e, e))]])
+    d, y = np.split(np.linalg.solve(K, -np.r_[g, a]), [n])
+    least = g @ d + d @ H @ d / 2
+    none = np.zeros(0)
+    for k in range(20):
+        z = rng.normal(size=n) * (k > 0)
+        near = Linear(g @ z + z @ H @ z / 2, g + H @ z, H, A @ z + a, A, none, np.zeros((0, n)))
+        state = sqp.State(z, near, y, none, np.zeros((n, n)), *[0.0] * 10)
+        assert dual_bound(state, low, high) == pytest.approx(least, rel=1e-10)
+        off = dual_bound(state._replace(y=y + rng.normal(size=e)), low, high)
+        assert off < least
+
+
+def test_the_table_says_what_became_of_each_and_json_holds_it():
+    structure = planners.Structure("hand", ("joint1", "joint2"))
+    best = planners.Candidate(structure, ("joint3",), "best", "", 0.1, 0.2, 0.1, 0.06, 0.04, 5.0, 7, 0.1)
+    other = replace(best, locked=(), status="solved", cost=0.25)
+    out = planners.Candidate(structure, ("joint1",), "unreachable", "no posture found", np.inf)
+    choice = planners.StructureChoice(TASK, (best, other, out))
+    head, *lines = str(choice).split("\n")
+    assert head.split() == "frame locked status cost more time torque smooth T, s".split()
+    assert "0.20000" in lines[0] and "+25.00 %" in lines[1] and "no posture found" in lines[2]
+    assert max(map(len, lines)) <= 80 and choice.best is best
+    rows = json.loads(choice.to_json())["candidates"]
+    assert [row["status"] for row in rows] == ["best", "solved", "unreachable"] and rows[2]["bound"] is None
+
+
+@pytest.mark.parametrize(
+    ("task", "candidates", "words"),
+    [
+        ("grasp", None, "kind 'grasp'"),
+        ("reach", [], "missing"),
+        ("reach", [planners.Structure("hand", ())], "moves nothing"),
+        ("reach", [planners.Structure("hand", ("joint9",))], "'joint9' of a candidate rests"),
+        ("reach", [planners.Structure("hant", ("joint1",))], "'hant'"),
+    ],
+)
+def test_what_cannot_be_chosen_is_refused(task, candidates, words):
+    with pytest.raises(ValueError, match=words):
+        planners.choose_structure(planners.load(task), candidates)
+
+
+@pytest.fixture(scope="module")
+def choices():
+    """The planar robot with up to one joint locked, with and without dropping, and what each compiled."""
+    out = []
+    for drop in (True, False):
+        planners.choose_structure(TASK, planners.lockings(TASK)[:1], drop=drop)
+        before = len(COMPILED)
+        choice = planners.choose_structure(TASK, drop=drop)
+        out.append((choice, len(COMPILED) - before))
+    return out
+
+
+@pytest.mark.slow
+def test_the_choice_is_that_of_all_candidates_and_compiles_nothing_more(choices):
+    assert len(COMPILED) > 3, "the first calls compile, or this test counts nothing"
+    (quick, _), (whole, _) = choices
+    assert [compiled for _, compiled in choices] == [0, 0]
+    assert quick.best.structure == whole.best.structure and quick.best.cost == whole.best.cost
+    assert all(c.bound <= c.cost for c in whole.candidates if c.cost)
+    assert [j.name for j in quick.task.joints] == list(quick.best.structure.joints)
+
+
+@pytest.mark.slow
+def test_the_best_of_64_structures_of_the_large_robot_is_found():
+    """Against all of them optimised; the first hand, with up to three of its seven joints locked."""
+    task = large(1)
+    candidates = planners.lockings(task, 3)
+    assert len(candidates) == 64
+    quick, whole = (planners.choose_structure(task, candidates, drop=drop) for drop in (True, False))
+    assert quick.best.structure == whole.best.structure and quick.best.cost == whole.best.cost
+    iterations = [sum(c.iterations for c in choice.candidates) for choice in (quick, whole)]
+    assert iterations[0] < 0.25 * iterations[1]
+    plan = planners.plan(quick.task, accuracy="accurate", progress=False)  # the choice's grid is coarse
+    assert plan.status == "solved", plan.verdict
