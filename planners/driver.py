@@ -10,7 +10,7 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from planners import sqp
+from planners import relax, sqp
 from planners.certify import certify
 from planners.plan import Plan
 from planners.problem import Outcome
@@ -72,6 +72,9 @@ def _planned(task, solver, seeds, accuracy, progress) -> Plan:
         info = {"options": options, "starts": dict(Counter(end.status for end in ends))}
         ends = [end for end in ends if end.status != "dropped"]
         found = _best(_result(task, problem, module, end, np.array(history), info) for end in ends)
+        if found.status == "infeasible" and solver == "sqp":
+            live.note("No motion keeps all constraints; which of them would have to give, and by how much?")
+            found = _explained(found, problem, ends[0], z[0])
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
     return replace(found, timing=timing)
 
@@ -122,6 +125,16 @@ def _best(results) -> Plan:
             return found
         first = first or found
     return first
+
+
+def _explained(found: Plan, problem, end: Outcome, guess) -> Plan:
+    """With what each constraint would have to give for a motion to exist, in its verdict and its description."""
+    from threadpoolctl import threadpool_limits  # as in _by_sqp
+
+    with threadpool_limits(1, "blas"):
+        needed = relax.relaxations(problem, end, guess)
+    info = found.info | {"relaxation": [x._asdict() for x in needed]}
+    return replace(found, verdict=f"{found.verdict} {relax.sentence(needed)}", info=info)
 
 
 def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:

@@ -299,7 +299,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     low, high = np.array([task.phases[name].duration for name in task.phases]).T
     units = (1.0, 0.1, 0.05)  # rad, rad/s, rad/s^2
     blocks = (
-        Block("durations", (4,), 10.0),
+        Block("durations", (4,), 10.0, "s"),
         Block("track_state", (3, n), units),
         Block("grasp_state", (3, n), units),
         Block("end", (n,)),

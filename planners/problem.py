@@ -40,6 +40,15 @@ class Summary(NamedTuple):
     below: np.ndarray  # [i]
 
 
+class Kept(NamedTuple):
+    """Numbers of a problem, and which of its rows are kept: 1, or 0 to leave one out; traced too."""
+
+    data: Any
+    equal: np.ndarray  # [e]
+    below: np.ndarray  # [i]
+    cost: np.ndarray  # [] factor
+
+
 class Linear(NamedTuple):
     """A problem near one point."""
 
@@ -100,6 +109,7 @@ class Block:
     name: str
     shape: tuple[int, ...]
     scale: float | tuple[float, ...] = 1.0
+    units: str = ""
 
     @property
     def size(self) -> int:
@@ -138,8 +148,16 @@ class Form:
         return out
 
     def at(self, z, data) -> Values:
-        """The problem at z (scaled)."""
-        return self.values(self.split(z), data)
+        """The problem at z (scaled); of rows that are not kept, nothing is asked."""
+        if not isinstance(data, Kept):
+            return self.values(self.split(z), data)
+        v = self.values(self.split(z), data.data)
+        return Values(
+            v.smooth * data.cost,
+            v.residual * jnp.sqrt(data.cost),
+            v.equal * data.equal,
+            v.below * data.below - (1 - data.below),
+        )
 
     def near(self, z, data) -> Linear:
         """The problem and its first derivatives at z (scaled): forward mode, one tangent per variable, batched."""
@@ -188,9 +206,10 @@ class Problem:
 
     @property
     def numbers(self) -> tuple:
-        """(data, lower [n], upper [n]): all that is traced; the bounds scaled."""
+        """(data, lower [n], upper [n]): all that is traced; the bounds scaled, and all rows kept."""
         free = lambda bounds, x: self.form.join({b.name: x for b in self.form.blocks} | bounds)
-        return self.data, free(self.lower, -np.inf), free(self.upper, np.inf)
+        rows = (np.ones(sum(rows.size for rows in groups)) for groups in (self.equal, self.below))
+        return Kept(self.data, *rows, np.ones(())), free(self.lower, -np.inf), free(self.upper, np.inf)
 
     def worst(self, equal, below, count: int = 3) -> list[tuple[str, float, str]]:
         """The groups that are violated most, relative to their scale: (name, amount, unit), physical units."""

@@ -222,6 +222,11 @@ def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
     return state, step, Found(z, real(1), real(0))
 
 
+def near(problem: Problem, z) -> Linear:
+    """The problem near a point z [n] (scaled), by what `solve` compiles."""
+    return _arrive(problem.form, *_blank(problem, z), problem.numbers).near
+
+
 def compile_all(problem: Problem) -> None:
     """Compiles what `solve` calls, side by side."""
     data, low, high = numbers = problem.numbers
@@ -236,18 +241,19 @@ def compile_all(problem: Problem) -> None:
             jax.block_until_ready(job.result())
 
 
-def solve(problem: Problem, z, *, iterations: int = 200) -> Iterator[list[State]]:
+def solve(problem: Problem, z, *, iterations: int = 200, numbers=None) -> Iterator[list[State]]:
     """Iterates from first guesses; the last states say how each ended.
 
     Args:
         problem: What is to be solved.
         z: First guesses [starts, n], scaled.
         iterations: At most, of each.
+        numbers: Others than the problem's own, of the same shapes.
 
     Returns:
         After each iteration, the states of all starts, in the order of the guesses.
     """
-    form, numbers = problem.form, problem.numbers
+    form, numbers = problem.form, numbers or problem.numbers
     _, low, high = numbers
     states = [_arrive(form, *_blank(problem, start), numbers) for start in np.clip(z, low, high)]
     while True:

@@ -118,3 +118,4 @@ def test_an_infeasible_task_is_found_out_and_named(plan, old, new, words):
     found = planners.plan(parse(TEXT.replace(old, new)), progress=False)  # same shapes: nothing compiles anew
     assert found.status == "infeasible"
     assert words in found.verdict and "off by" in found.verdict
+    assert found.info["relaxation"] and "relax" in found.verdict

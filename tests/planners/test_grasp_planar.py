@@ -62,17 +62,26 @@ def test_a_wanted_error_decides_the_grid(plan):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "words", "enough", "amount", "unit"),
     [
-        ("position = [1.7223", "position = [4.7223", "place of 'hand'"),
-        ("margin =", "torque = 1e-3\nmargin =", "torque limit"),
+        ("position = [1.7223", "position = [4.7223", "place of 'hand'", "place of 'hand' on", 2.804, "m"),
+        pytest.param(
+            "margin =", "torque = 1e-3\nmargin =", "torque limit", "every torque limit", 0.097, "N m",
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["out of reach", "too weak"],
-)
-def test_an_infeasible_task_is_found_out_and_named(plan, old, new, words):
-    found = planners.plan(parse(TEXT.replace(old, new)), progress=False)  # same shapes: nothing compiles anew
+)  # fmt: skip
+def test_an_infeasible_task_is_found_out_and_explained(plan, old, new, words, enough, amount, unit):
+    """Tasks of the same shapes, so that nothing compiles anew. With 0.1 N m more the weak one has a plan to 3e-6, with
+    0.06 N m none is found."""
+    found = planners.plan(parse(TEXT.replace(old, new)), progress=False)
     assert found.status == "infeasible"
     assert words in found.verdict and "off by" in found.verdict
+    (first, *others) = found.info["relaxation"]
+    assert first["name"].startswith(enough) and first["unit"] == unit
+    assert abs(first["amount"] - amount) < 0.05 * amount and f"{first['amount']:.3g} {unit}" in found.verdict
+    assert all(x["amount"] is None for x in others)
 
 
 @pytest.mark.slow
