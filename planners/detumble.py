@@ -39,7 +39,7 @@ class Data(NamedTuple):
     torque: jax.Array  # [n]
     wrench: jax.Array  # [6] limits of moment and force on the base
     margin: jax.Array  # [] part of the limits of what acts that is kept free
-    rest: jax.Array  # [] tolerance of the velocities at the end
+    rest: jax.Array  # [6 + n] tolerance of the velocities at the end
     time: jax.Array  # [] weight, 1/s
     weights: jax.Array  # [6 + n] of the squares of what acts
     end_weights: jax.Array  # [6 + n] of the squares of the velocities at the end
@@ -75,7 +75,7 @@ class Detumble:
             within(data, P[:, 6:], self.spline.hull(1) @ P[:, 6:] / T, acting[:, 6:]),
             two_sided(acting[:, :6] / data.wrench, data.margin - 1, 1 - data.margin),
             two_sided(P[:, 3:6], -flying.TURN, flying.TURN),
-            two_sided(v[-1, resting] / data.rest, -1.0, 1.0),
+            two_sided((v[-1] / data.rest)[resting], -1.0, 1.0),
         )
         residual = jnp.concatenate([effort.ravel(), left])
         return Values(data.time * T, residual, jnp.zeros(0), jnp.concatenate(below))
@@ -88,8 +88,10 @@ def rows(task: Task, values: Detumble) -> tuple[Rows, ...]:
     named = [(f"{words} {axis}", unit) for words, unit in kinds for axis in "xyz"]
     wrench = [Rows(name, x, unit, (points, 2)) for (name, unit), x in zip(named, task.base_limits, strict=True)]
     turn = Rows("turn of the base", 1.0, "rad", (3, count, 2))
-    end = Rows("velocity at the end", task.end.speed, "rad/s, m/s", (len(values.resting), 2))
-    return *limit_rows(task, count, count - 1, points), *wrench, turn, end
+    speed, joints = task.end.speed, len(values.resting) - 6
+    base = Rows("velocity of the base at the end", speed * 3**-0.5, "rad/s, m/s", (6, 2))
+    rates = Rows("joint rates at the end", speed, "rad/s", (joints, 2))
+    return *limit_rows(task, count, count - 1, points), *wrench, turn, base, rates
 
 
 _start = jax.jit(flying.start, **ONCE)
@@ -104,7 +106,8 @@ def data(task: Task) -> Data:
         task.torque_limits,
         task.base_limits,
         task.limits.margin,
-        task.end.speed,
+        task.end.speed
+        * np.r_[np.full(6, 3**-0.5), np.ones(len(task.joints))],  # so that the base's speeds are within it
         w.time,
         np.repeat([w.base_torque, w.base_force, w.joint_torque], [3, 3, len(task.joints)]),
         np.r_[[w.end_base] * 6, [w.end_joints * (joint.name not in task.base.wheels) for joint in task.joints]],

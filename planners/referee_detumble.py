@@ -70,5 +70,5 @@ def programme(task, problem, z) -> Programme:
     nlp.below(of(acting[6:, :], task.torque_limits), -free, free)
     nlp.below(of(acting[:6, :], task.base_limits), -free, free)
     nlp.below(P[:, 3:6], -flying.TURN, flying.TURN)
-    nlp.below((v[list(values.resting), -1] / task.end.speed).T, -1, 1)
+    nlp.below((v[:, -1] / ca.DM(np.asarray(data.rest)))[list(values.resting)].T, -1, 1)
     return nlp
