@@ -9,7 +9,10 @@ plan.save("out/grasp")
 from planners.certify import Certificate, certify
 from planners.compare import Table, compare
 from planners.driver import plan
+from planners.estimate import Estimate, estimate
 from planners.ik import Posture, inverse_kinematics
+from planners.measure import Measurements, measure
+from planners.monte_carlo import MonteCarlo, monte_carlo
 from planners.plan import PhaseResult, Plan, PlanError
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study

@@ -254,7 +254,7 @@ def gyro(plan, motions) -> Figure:
 def information(plan) -> Figure:
     """How well the manoeuvre tells the parameters: standard deviations, and singular values of the information."""
     found = plan.info["results"]
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(10.0, max(4.2, 0.28 * len(found["singular_values"]))), layout="constrained")
     left, right = figure.subplots(1, 2)
     deviations = found.get("sigma_percent")
     if deviations:
@@ -275,7 +275,7 @@ def information(plan) -> Figure:
     for panel in (left, right):
         panel.tick_params(labelsize=8)
         panel.spines[["top", "right"]].set_visible(False)
-    figure.suptitle("Information about the base", fontsize=12, x=0.01, ha="left", fontweight="bold")
+    figure.suptitle("Information about the parameters", fontsize=12, x=0.01, ha="left", fontweight="bold")
     return figure
 
 

@@ -43,6 +43,9 @@ class Momentum(NamedTuple):
     angular: jax.Array  # [3] N m s, about the centre of mass
 
 
+AT_REST = Momentum(*np.zeros((3, 3)))
+
+
 def hat(x):
     """Cross-product matrix [3, 3] of x [3]."""
     return jnp.dot(_HAT.astype(x.dtype), x)
@@ -206,9 +209,9 @@ def locally(f):
     """A function of a chain and a point x [m], over points [k, m], whose derivative is one small Jacobian per point.
 
     A tangent of the whole batch is then one matrix product, whatever the kernels inside f cost; the chains, stacked
-    [k, ...] or one for all points, are constants.
+    [k, ...] or one for all points, are constants, or what else f takes in their place.
     """
-    over = lambda chains: (0 if jnp.ndim(chains.base_value) == 2 else None, 0)
+    over = lambda chains: (0 if isinstance(chains, sdyn.Chain) and chains.base_value.ndim == 2 else None, 0)
 
     @jax.custom_jvp
     def batch(chains, x):

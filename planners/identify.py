@@ -1,14 +1,12 @@
-"""The manoeuvre that shows the inertial parameters of a free-floating base, as a problem.
+"""The manoeuvre that shows inertial parameters of a free-floating base, of what it holds, or of both, as a problem.
 
 Variables: the duration and the inner control points of a quintic spline of every joint, which starts and ends at rest
-in the same posture. Total momentum is zero, so with phi = (m, m c, I) of the base, about its origin,
-
-    M_bb v + M_bj qd = 0,   d M_bb / d phi_i = D_i, constant,
-    dv/dphi_i = -M_bb^-1 D_i v,   dv'/dphi_i = -M_bb^-1 (D_i v' + M_bb' dv/dphi_i),
-    dtheta/dphi_i = int R dw/dphi_i dt.
-
-The Fisher information sums these, through the sensors, over the samples; the cost is minus its log determinant.
-Source: Swevers et al. (1997), Optimal robot excitation; the momentum form after Rackl et al. (2013).
+in the same posture. Total momentum is zero; `inertial.response` says what the base and the joint torques then do, for
+parameters phi of the bodies that are not known. Its derivatives for phi, and dtheta/dphi_i = int R dw/dphi_i dt for
+the attitude theta, are seen by the sensors; the Fisher information sums their squares over the samples, and the cost is
+minus its log determinant. A constant bias of a sensor is a nuisance: the Schur complement over it is the sum of squares
+about the mean. The joints' path counts as known here; `estimate` lets encoders tell it.
+Source: Swevers et al. (1997), Optimal robot excitation; Rackl, Lampariello and Albu-Schaeffer (2013).
 """
 
 import functools
@@ -20,25 +18,26 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
-from planners import floating
+from planners import floating, inertial
 from planners.bspline import Clamped
 from planners.floating import Motion
+from planners.inertial import PARAMETERS
 from planners.joints import effort, limit_rows, trapezoid, within
 from planners.plan import PhaseResult
 from planners.problem import ONCE, Block, Form, Problem, Rows, Values, summary
 from planners.sqp import PENALTIES, merit
 from planners.task import Task
 
-PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 GAP = 1e-6  # relative singular value below which a direction counts as not identifiable
+LOST = 0.3  # entry of a direction below which a parameter is not named
 
 
 class Data(NamedTuple):
     """Numbers of one manoeuvre; all traced."""
 
     chain: sdyn.Chain
-    slopes: jax.Array  # [10, 6, 6] D_i, times the parameter's nominal magnitude
+    origins: jax.Array  # [k] frames at the origins of the bodies that are not known
+    sizes: jax.Array  # [k, 10] magnitudes of their parameters
     q0: jax.Array  # [n]
     position: jax.Array  # [n, 2] limits
     rate: jax.Array  # [n]
@@ -46,7 +45,8 @@ class Data(NamedTuple):
     margin: jax.Array  # []
     attitude: jax.Array  # [] rad
     lever: jax.Array  # [3] m
-    sensors: jax.Array  # [3] sqrt(samples per second) / noise of gyro, accelerometer, star tracker; zero if absent
+    sensors: jax.Array  # [9 + n] sqrt(samples per second) / noise of the sensors' entries; zero if absent
+    biased: jax.Array  # [9 + n] 1 for an entry with an unknown constant bias, else 0
     weights: jax.Array  # [4] information, time, torque, smoothness
 
 
@@ -56,40 +56,51 @@ def control_points(spline: Clamped, x, q0):
     return jnp.concatenate([still, x["excite"], still])
 
 
-def _sensitivities(data: Data, q, v, vdot):
-    """Derivatives of angular velocity and specific force for the ten parameters, [6, 10], and dw [3, 10], from the
-    joints and the velocities and accelerations of everything.
-    """
-    inertia = lambda q: sdyn.mass_matrix(data.chain, floating.at_rest(q))[:6, :6]
-    M, slope = jax.jvp(inertia, (q,), (v[6:],))
-    v, vdot = v[:6], vdot[:6]
-    dv = -jnp.linalg.solve(M, jnp.einsum("pij,j->ip", data.slopes, v))
-    dvdot = -jnp.linalg.solve(M, jnp.einsum("pij,j->ip", data.slopes, vdot) + slope @ dv)
-
-    def felt(v, vdot):
-        w, r = v[:3], data.lever
-        return vdot[3:] + floating.cross(w, v[3:] + floating.cross(w, r)) + floating.cross(vdot[:3], r)
-
-    df = jax.vmap(lambda a, b: jax.jvp(felt, (v, vdot), (a, b))[1], (1, 1), 1)(dv, dvdot)
-    return jnp.concatenate([data.sensors[0] * dv[:3], data.sensors[1] * df]), dv[:3]
+def joint_path(spline: Clamped, intervals: int, x, q0):
+    """Joint positions, rates and accelerations at grid points and midpoints, [2 intervals + 1, n] each."""
+    T, P, s = x["duration"][0], control_points(spline, x, q0), np.linspace(0, 1, 2 * intervals + 1)
+    return tuple(spline.basis(s, order) @ P / T**order for order in range(3))
 
 
 def motion(spline: Clamped, intervals: int, x, data: Data) -> Motion:
     """The motion on the grid, from the variables by name."""
-    T, P = x["duration"][0], control_points(spline, x, data.q0)
-    s = np.linspace(0, 1, 2 * intervals + 1)
-    path = tuple(spline.basis(s, order) @ P / T**order for order in range(3))
-    return floating.at_zero_momentum(data.chain, path, np.linspace(0, 1, intervals + 1) * T)
+    times = np.linspace(0, 1, intervals + 1) * x["duration"][0]
+    return floating.at_zero_momentum(data.chain, joint_path(spline, intervals, x, data.q0), times)
+
+
+@floating.locally
+def _slopes(data: Data, x):
+    """Derivatives of angular velocity, specific force and joint torques for the parameters [(6 + n) p], one after the
+    other; x are joint positions, rates and accelerations.
+    """
+    path = inertial.path(data.chain, data.origins, *jnp.split(x, 3))
+
+    def seen(change):
+        twist, acceleration, tau = inertial.response(path, change.reshape(-1, 10) * data.sizes)
+        return jnp.concatenate([twist[:3], inertial.felt(data.lever, twist, acceleration), tau])
+
+    return jax.jacfwd(seen)(jnp.zeros(data.sizes.size)).ravel()
+
+
+def sensitivities(data: Data, at: Motion):
+    """What the sensors see of the parameters, per root second and parameter's magnitude: [k + 1, 9 + n, p] of gyro,
+    accelerometer, attitude and torques, about their means where a bias hides those.
+    """
+    n = len(data.q0)
+    seen = _slopes(data, jnp.concatenate([at.q, at.v[:, 6:], at.vdot[:, 6:]], axis=1))
+    seen, steps = seen.reshape(-1, 6 + n, data.sizes.size), jnp.diff(at.times)
+    turning = at.R @ seen[:, :3]
+    turned = jnp.cumsum((turning[1:] + turning[:-1]) / 2 * steps[:, None, None], axis=0)
+    turned = jnp.concatenate([jnp.zeros_like(turned[:1]), turned])
+    seen = jnp.concatenate([seen[:, :6], turned, seen[:, 6:]], axis=1)
+    mean = jnp.einsum("k,kij->ij", trapezoid(steps) / at.times[-1], seen)
+    return data.sensors[:, None] * (seen - data.biased[:, None] * mean)
 
 
 def information(data: Data, at: Motion):
-    """Fisher information [10, 10] of the parameters, relative to their nominal magnitudes."""
-    felt, spin = jax.vmap(_sensitivities, (None, 0, 0, 0))(data, at.q, at.v, at.vdot)
-    turning, steps = at.R @ spin, jnp.diff(at.times)
-    turned = jnp.cumsum((turning[1:] + turning[:-1]) / 2 * steps[:, None, None], axis=0)
-    turned = jnp.concatenate([jnp.zeros((1, 3, 10)), turned])
-    seen = jnp.concatenate([felt, data.sensors[2] * turned], axis=1)
-    return jnp.einsum("k,kij,kil->jl", trapezoid(steps), seen, seen)
+    """Fisher information [p, p] of the parameters, relative to their magnitudes, biases being unknown."""
+    seen = sensitivities(data, at)
+    return jnp.einsum("k,kij,kil->jl", trapezoid(jnp.diff(at.times)), seen, seen)
 
 
 @dataclass(frozen=True)
@@ -116,42 +127,19 @@ class Identify:
         )
 
 
-def nominal(link: sdyn.Link) -> tuple[np.ndarray, np.ndarray]:
-    """The ten parameters of a link, about its origin, and the magnitudes that they are measured against."""
-    c = link.com
-    I = link.inertia + link.mass * (c @ c * np.eye(3) - np.outer(c, c))
-    radius = np.sqrt(np.trace(link.inertia) / (2 * link.mass))  # of gyration
-    size = np.trace(link.inertia) / 3
-    return np.r_[link.mass, link.mass * c, [I[pair] for pair in PAIRS]], np.r_[
-        link.mass, [link.mass * radius] * 3, [size] * 6
-    ]
-
-
-def _with_base(chain, index, phi):
-    """The chain with other parameters (about the link's origin) of one link."""
-    known, c = sdyn.params(chain), phi[1:4] / phi[0]
-    I = jnp.array([[phi[4], phi[5], phi[6]], [phi[5], phi[7], phi[8]], [phi[6], phi[8], phi[9]]])
-    I = I - phi[0] * (c @ c * jnp.eye(3) - jnp.outer(c, c))
-    put = lambda old, new: old.at[index].set(new)
-    new = replace(known, mass=put(known.mass, phi[0]), com=put(known.com, c), inertia=put(known.inertia, I))
-    return sdyn.with_params(chain, new)
-
-
-@functools.partial(jax.jit, static_argnums=1, **ONCE)
-def _slopes(chain, index, phi, q):
-    at = lambda phi: sdyn.mass_matrix(_with_base(chain, index, phi), floating.at_rest(q))[:6, :6]
-    return jnp.moveaxis(jax.jacfwd(at)(phi), -1, 0)
-
-
 def data(task: Task) -> Data:
     """The numbers of a task."""
-    robot, s, w = task.chaser, task.sensors, task.weights
-    chain, base = sdyn.pack(robot), [link.name for link in robot.links].index(robot.base)
-    phi, size = nominal(robot.links[base])
-    weight = lambda noise: 0.0 if noise is None else np.sqrt(s.rate) / noise
+    s, w, n = task.sensors, task.weights, len(task.joints)
+    frames = tuple(sdyn.Frame(f"origin of {link}", link) for link in task.unknown.values())
+    count = len(task.chaser.frames)
+    robot = replace(task.chaser, frames=task.chaser.frames + frames)
+    widths = {"gyro": 3, "accelerometer": 3, "star_tracker": 3, "torque": n}
+    entries = lambda value: jnp.concatenate([jnp.full(width, value(name)) for name, width in widths.items()])
+    noise = {name: getattr(s, name) for name in widths}
     return Data(
-        chain,
-        np.asarray(_slopes(chain, base, phi, task.start)) * size[:, None, None],
+        sdyn.pack(robot),
+        jnp.arange(count, count + len(frames)),
+        jnp.stack([inertial.nominal(robot.link(link))[1] for link in task.unknown.values()]),
         jnp.asarray(task.start),
         np.clip(task.position_limits, -1e3, 1e3),
         jnp.asarray(task.rate_limits),
@@ -159,7 +147,8 @@ def data(task: Task) -> Data:
         jnp.asarray(task.limits.margin),
         jnp.asarray(task.attitude or 3.0),
         jnp.asarray(s.lever),
-        jnp.array([weight(s.gyro), weight(s.accelerometer), weight(s.star_tracker)]),
+        entries(lambda name: 0.0 if noise[name] is None else np.sqrt(s.rate) / noise[name]),
+        entries(lambda name: float(getattr(s, f"{name}_bias"))),
         jnp.array([w.information, w.time, w.torque, w.smoothness]),
     )
 
@@ -196,14 +185,13 @@ def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     return np.stack(guesses)[np.argsort(merits, kind="stable")[:count]]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)
-def _detailed(spline, intervals, x, data):
-    return motion(spline, intervals, x, data)
+detailed = functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)(motion)
+informed = functools.partial(jax.jit, **ONCE)(information)
 
 
 def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
     """The motion on a grid `fine` times finer than the solver's, from the variables by name."""
-    at = jax.tree.map(np.asarray, _detailed(*_shape(task, fine), x, data))
+    at = jax.tree.map(np.asarray, detailed(*_shape(task, fine), x, data))
     q = np.hstack([at.p, floating.path_quaternions(at.R), at.q])
     tau = np.hstack([np.zeros((len(at.tau), 6)), at.tau])
     return (PhaseResult("excite", task.chaser, at.times, q, at.v, tau),)
@@ -211,15 +199,16 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
 
 def results(task: Task, problem: Problem, x: dict) -> dict:
     """What the manoeuvre tells about the parameters."""
-    at = _detailed(*_shape(task, 1.0), x, problem.data)
-    F = np.asarray(jax.jit(information)(problem.data, at))
+    at = detailed(*_shape(task, 1.0), x, problem.data)
+    F = np.asarray(informed(problem.data, at))
     values, vectors = np.linalg.eigh(F)
     sees = values > GAP**2 * values[-1]
-    base = task.chaser.link(task.chaser.base)
+    names = [f"{body} {name}" for body in task.unknown for name in PARAMETERS]
+    links = [inertial.nominal(task.chaser.link(link)) for link in task.unknown.values()]
     out = {
-        "parameters": PARAMETERS,
-        "nominal": nominal(base)[0].tolist(),
-        "magnitudes": nominal(base)[1].tolist(),
+        "parameters": names,
+        "nominal": np.concatenate([phi for phi, _ in links]).tolist(),
+        "magnitudes": np.concatenate([size for _, size in links]).tolist(),
         "log_det": float(np.linalg.slogdet(F)[1]),
         "smallest_eigenvalue": float(values[0]),
         "condition_number": float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else None,
@@ -229,12 +218,20 @@ def results(task: Task, problem: Problem, x: dict) -> dict:
     if sees.all():
         C = np.linalg.inv(F)
         out["trace_of_inverse"] = float(np.trace(C))
-        out["sigma_percent"] = dict(zip(PARAMETERS, (100 * np.sqrt(np.diag(C))).tolist(), strict=True))
-        out["subspace"] = f"all ten parameters are identifiable; singular values span {out['condition_number']:.2g}"
+        out["sigma_percent"] = dict(zip(names, (100 * np.sqrt(np.diag(C))).tolist(), strict=True))
+        span = f"singular values span {out['condition_number']:.2g}"
+        out["subspace"] = f"all {len(names)} parameters are identifiable; {span}"
     else:
-        lost = [PARAMETERS[np.argmax(np.abs(v))] for v in vectors[:, ~sees].T]
-        out["subspace"] = f"{sees.sum()} of ten directions are identifiable; lost are mostly {', '.join(lost)}"
+        lost = "; ".join(_direction(v, names) for v in vectors[:, ~sees].T)
+        out["subspace"] = f"{sees.sum()} of {len(names)} directions are identifiable; lost are {lost}"
     return out
+
+
+def _direction(v, names) -> str:
+    """A direction among the parameters, relative to their magnitudes, in words: its largest entries."""
+    v = v * np.sign(v[np.argmax(np.abs(v))])
+    order = np.argsort(-np.abs(v), kind="stable")
+    return " ".join(f"{v[k]:+.2f} {names[k]}" for k in order if abs(v[k]) > LOST)
 
 
 def sentence(x: dict, info: dict) -> str:

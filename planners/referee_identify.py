@@ -12,9 +12,10 @@ attitude's sensitivity, are variables too.
 import casadi as ca
 import numpy as np
 
-from planners import identify, symbolic
+from planners import inertial, symbolic
 from planners.collocation import Drift, base_of, collocated, drift_of, limit_joints, running_cost, symbols
 from planners.referee import Programme, matrix
+from planners.task import TaskError
 
 UPPER = np.triu_indices(10)
 
@@ -36,7 +37,7 @@ def sensitivities(system: Drift, task) -> ca.Function:
     V, phi = ca.SX.sym("V", 6), ca.SX.sym("phi", 10)
     wrench, _ = symbolic.newton_euler(system.tree, q, V, rates, a, qdd)
     own = _momentum(phi, a) + symbolic.force_cross(V, _momentum(phi, V))
-    _, size = identify.nominal(task.chaser.link(task.chaser.base))
+    _, size = inertial.nominal(task.chaser.link(task.chaser.base))
     factor = ca.chol(ca.jacobian(wrench, a))
     solve = lambda b: -ca.solve(factor, ca.solve(factor.T, b))
     dV = solve(ca.jacobian(_momentum(phi, V), phi) @ ca.diag(size))
@@ -68,6 +69,12 @@ def squares(rows: int) -> ca.Function:
 
 def programme(task, problem, z) -> Programme:
     """The task, to be started from the variables z of `problem`."""
+    biased = any(getattr(task.sensors, f"{name}_bias") for name in ("gyro", "accelerometer", "star_tracker"))
+    if list(task.unknown) != ["base"] or task.sensors.torque or biased:
+        raise TaskError(
+            "the referee states the parameters of the base alone, seen by gyro, accelerometer and star tracker "
+            'without biases; plan this task with solver "sqp".'
+        )
     nlp, form = Programme(problem, z), problem.form.values
     spline, K = form.spline, form.intervals + 1
     T, free = nlp.x["duration"][0], nlp.x["excite"]

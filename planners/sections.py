@@ -66,6 +66,17 @@ def named_numbers():
     return field(default_factory=dict, metadata={"check": check})
 
 
+def flag():
+    """A field that holds true or false; false if left out."""
+
+    def check(value, where):
+        if not isinstance(value, bool):
+            raise TaskError(f"{where} is {value!r}; it must be true or false.")
+        return value
+
+    return field(default=False, metadata={"check": check})
+
+
 def names():
     """A field that holds a list of names."""
 
@@ -116,7 +127,7 @@ class Goal:
 
 @dataclass(frozen=True, kw_only=True)
 class Held:
-    """Section [target]: a free rigid body whose frame the hand holds."""
+    """Section [target] or [load]: a free rigid body whose frame the hand holds."""
 
     model: str = text()
     frame: str = text(default="grasp")
@@ -222,18 +233,30 @@ class Effort:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """Section [sensors]: what the base carries, white noise per sample; no noise given, no such sensor."""
+    """Section [sensors]: white noise per sample, and whether there is an unknown constant bias too; no noise given, no
+    such sensor.
+    """
 
     rate: float = number(1e-3, default=10.0)
     """Samples per second."""
     gyro: float | None = number(1e-12, default=None)
     """rad/s."""
+    gyro_bias: bool = flag()
     accelerometer: float | None = number(1e-12, default=None)
     """m/s^2, of the specific force."""
+    accelerometer_bias: bool = flag()
     lever: tuple = vector(3, default=(0.0, 0.0, 0.0))
     """Place of the accelerometer, base axes [m]."""
     star_tracker: float | None = number(1e-12, default=None)
     """rad."""
+    star_tracker_bias: bool = flag()
+    """World axes: the attitude at the start is then not known either."""
+    torque: float | None = number(1e-12, default=None)
+    """N m or N, of every joint."""
+    torque_bias: bool = flag()
+    encoder: float | None = number(1e-12, default=None)
+    """rad or m, of every joint; for the estimator. The planner takes the joints' path as known."""
+    encoder_bias: bool = flag()
 
 
 PHASES = {
@@ -244,7 +267,7 @@ PHASES = {
 }
 SECTIONS = {
     "grasp": {"robot": Chaser, "target": Passive, "limits": Limits, "tolerance": Tolerance, "weights": Weights},
-    "identify": {"robot": Chaser, "limits": Limits, "sensors": Sensors, "weights": Weights},
+    "identify": {"robot": Chaser, "load": Held, "limits": Limits, "sensors": Sensors, "weights": Weights},
     "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
     "detumble": {
         "robot": Chaser,
@@ -256,3 +279,4 @@ SECTIONS = {
         "weights": Effort,
     },
 }
+OPTIONAL = ("load",)

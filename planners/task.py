@@ -7,13 +7,14 @@ refused with the closest ones.
 import difflib
 import hashlib
 import tomllib
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 import sdyn
 from planners.sections import (
+    OPTIONAL,
     PHASES,
     SECTIONS,
     Actuators,
@@ -52,6 +53,9 @@ class Task:
     target: Passive | Held | None = None
     body: sdyn.Robot | None = None
     """The target's structure; its names carry the prefix "target_"."""
+    load: Held | None = None
+    unknown: dict[str, str] = field(default_factory=dict)
+    """What is to be identified, "base" or "load": the name of its link."""
     sensors: Sensors | None = None
     goal: Goal | None = None
     capture: Capture | None = None
@@ -72,7 +76,7 @@ class Task:
     @property
     def reads_files(self) -> bool:
         """Whether a robot comes from a file next to the task, not from the shipped ones."""
-        models = [self.robot.model] + ([self.target.model] if self.target else [])
+        models = [part.model for part in (self.robot, self.target, self.load) if part]
         return any(Path(model).suffix for model in models)
 
     @property
@@ -168,17 +172,18 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     kind = tree.pop("kind", None)
     if not isinstance(kind, str) or kind not in SECTIONS:
         raise TaskError(f"the key kind is {kind!r}; it must be one of {', '.join(map(repr, SECTIONS))}.")
-    extra = {}
+    extra, sought = {}, tree.pop("parameters", ["base"]) if kind == "identify" else []
     if kind == "identify":
         extra["attitude"] = _attitude(tree.pop("attitude", None))
     _refuse_unknown(tree, {*SECTIONS[kind], "phases"}, "the task")
     phases = tree.get("phases", {})
     _refuse_unknown(_table(phases, "[phases]"), PHASES[kind], "[phases]")
-    sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in SECTIONS[kind].items()}
+    given = {key: record for key, record in SECTIONS[kind].items() if key in tree or key not in OPTIONAL}
+    sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in given.items()}
     sections["phases"] = {p: _section(phases.get(p, {}), Phase, f"[phases.{p}]") for p in PHASES[kind]}
     chaser = _chaser(sections["robot"], folder)
     task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
-    return _checked(task, folder)
+    return _checked(_loaded(task, sought), folder)
 
 
 def _attitude(value):
@@ -236,6 +241,25 @@ def _chaser(section, folder):
     if several:
         raise TaskError(f"joint {several[0]!r} has several degrees of freedom; a task cannot lock it.")
     return robot.lock({j.name: section.joints.get(j.name, 0.0) for j in still})
+
+
+def _loaded(task, sought):
+    """The task of an identification with its load in the hand, and with the links whose parameters are sought."""
+    if task.kind != "identify":
+        return task
+    bodies = {"base": task.chaser.base}
+    if task.load:
+        body = _model(task.load.model, task.folder)
+        if body.grounded or len(body.links) != 1:
+            raise TaskError(f"[load] model {task.load.model!r} must be one free link.")
+        bodies["load"] = f"load_{body.links[0].name}"
+        chaser = task.chaser.attach(body.prefixed("load_"), task.robot.frame, f"load_{task.load.frame}")
+        task = replace(task, chaser=chaser)
+    if not isinstance(sought, list) or not sought or any(x not in ("base", "load") for x in sought):
+        raise TaskError(f'parameters is {sought!r}; it must be ["base"], ["load"] or ["base", "load"].')
+    if "load" in sought and not task.load:
+        raise TaskError('parameters names "load"; add the section [load] with its model.')
+    return replace(task, unknown={name: link for name, link in bodies.items() if name in sought})
 
 
 def _checked(task, folder):

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -82,3 +84,20 @@ BAD = [
 def test_bad_options_are_refused(option, words):
     with pytest.raises(planners.TaskError, match=words):
         planners.plan(planners.load("grasp"), progress=False, **option)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('["base", "load"]', '["hand"]', ["'hand'", '["base", "load"]']),
+        ('[load] # in the hand\nmodel = "sat50"\nframe = "grasp"\n', "", ["section [load]"]),
+        ('model = "sat50"', 'model = "deos7"', ["[load]", "one free link"]),
+        ("gyro_bias = true", "gyro_bias = 1", ["gyro_bias", "true or false"]),
+    ],
+)
+def test_a_bad_identification_is_refused(old, new, words):
+    source = (Path(__file__).parents[1] / "data" / "identify_load.toml").read_text()
+    assert old in source
+    with pytest.raises(ValueError) as error:
+        parse(source.replace(old, new, 1))
+    assert all(word in str(error.value) for word in words), error.value
