@@ -142,6 +142,12 @@ def test_estimates_scatter_as_the_bound_says(scene):
     assert 0.85 < found.normalised < 1.15  # of 1200 normalised errors
 
 
+@pytest.mark.slow
+def test_two_hundred_estimates_scatter_as_the_bound_says(scene):
+    found = planners.monte_carlo(scene.task, scene.x, draws=200, truth=scene.truth)
+    assert found.passed, (found.statuses, found.ratios, found.band, found.normalised, found.normalised_band)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
