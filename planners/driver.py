@@ -73,8 +73,7 @@ def _planned(task, solver, seeds, accuracy, progress) -> Plan:
         ends = [end for end in ends if end.status != "dropped"]
         found = _best(_result(task, problem, module, end, np.array(history), info) for end in ends)
         if found.status == "infeasible" and solver == "sqp":
-            live.note("No motion keeps all constraints; which of them would have to give, and by how much?")
-            found = _explained(found, problem, ends[0], z[0])
+            found = _explained(found, problem, ends[0], z[0], live)
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
     return replace(found, timing=timing)
 
@@ -127,12 +126,12 @@ def _best(results) -> Plan:
     return first
 
 
-def _explained(found: Plan, problem, end: Outcome, guess) -> Plan:
+def _explained(found: Plan, problem, end: Outcome, guess, live) -> Plan:
     """With what each constraint would have to give for a motion to exist, in its verdict and its description."""
     from threadpoolctl import threadpool_limits  # as in _by_sqp
 
     with threadpool_limits(1, "blas"):
-        needed = relax.relaxations(problem, end, guess)
+        needed = relax.relaxations(problem, end, guess, live.note)
     info = found.info | {"relaxation": [x._asdict() for x in needed]}
     return replace(found, verdict=f"{found.verdict} {relax.sentence(needed)}", info=info)
 

@@ -30,8 +30,8 @@ STIFF = (1.0, 1e-4, 1e3)  # weight of a step's length, first, smallest and last;
 CHEAP = 10.0  # cost at the start, beyond which it counts for less
 LONGEST = 1.0  # step of a scaled variable
 WORTH = 0.3  # part of the promised gain that makes the next step bolder
-TRIES = 100  # iterations of the solver without a group
-ITERATIONS, PATIENCE = 100, 12  # steps that lower t, and those in a row that gain nothing
+TRIES = 60  # iterations of the solver without a group
+ITERATIONS, PATIENCE = 60, 12  # steps that lower t, and those in a row that gain nothing
 
 
 class Group(NamedTuple):
@@ -64,19 +64,22 @@ class Point(NamedTuple):
     rest: float
 
 
-def relaxations(problem: Problem, end: Outcome, guess) -> list[Relaxation]:
+def relaxations(problem: Problem, end: Outcome, guess, say=lambda words: None) -> list[Relaxation]:
     """What the most promising groups would have to give, each alone; the smallest relative to its scale comes first.
 
     Args:
         problem: One that ended as infeasible; what the solver compiled for it is used again.
         end: Where, with its multipliers: only what holds there can help.
         guess: A first guess [n], scaled: another point to start from.
+        say: Is told what is looked at, group by group.
     """
-    groups = candidates(problem, end)
-    found = [_found(problem, group, end.z, guess) for group in groups]
+    groups, found = candidates(problem, end), []
+    for k, group in enumerate(groups, start=1):
+        say(f"How much would have to give, {k} of {len(groups)}: {group.name}?")
+        found.append(_found(problem, group, end.z, guess))
     order = sorted(range(len(groups)), key=lambda k: np.inf if found[k] is None else found[k])
-    say = lambda group, t: Relaxation(group.name, None if t is None else float(t * group.scale), group.unit)
-    return [say(groups[k], found[k]) for k in order]
+    needed = lambda group, t: Relaxation(group.name, None if t is None else float(t * group.scale), group.unit)
+    return [needed(groups[k], found[k]) for k in order]
 
 
 def sentence(needed: list[Relaxation]) -> str:
