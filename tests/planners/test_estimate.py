@@ -32,8 +32,12 @@ def motion(task, seconds=25.0):
 
 @pytest.fixture(scope="module")
 def scene():
+    return shaken(CHEAP)
+
+
+def shaken(text):
     """A task, a motion, and a robot whose base and load differ by about 5 percent from the task's."""
-    task = parse(CHEAP, "shaken")
+    task = parse(text, "shaken")
     x, rng = motion(task), np.random.default_rng(3)
     change = lambda phi: np.asarray(inertial.consistent(phi, jnp.asarray(0.05 * rng.normal(size=10))))
     phi = {link: change(phi) for link, phi in zip(task.unknown.values(), first_guess(task), strict=True)}
@@ -134,6 +138,17 @@ def test_an_estimate_is_as_far_off_as_it_says(scene):
     assert found.robot.link("base").mass == found.parameters["base"][0]
     unseen = measured._replace(gyro=measured.gyro.at[3, 0].set(jnp.nan))
     assert planners.estimate(scene.task, scene.x, unseen).status == "not finite"
+
+
+@pytest.mark.slow
+def test_encoders_and_their_bias_are_part_of_the_estimate():
+    """The joints leave the planned path by ten times the encoders' noise; the estimate allows for that."""
+    scene = shaken(TEXT.replace("rate = 10.0", "rate = 2.72"))
+    measured = planners.measure(scene.task, scene.x, truth=scene.truth, seed=1)
+    found = planners.estimate(scene.task, scene.x, measured)
+    assert found.status == "solved" and 0.8 < found.misfit < 1.2  # measured 0.95
+    errors = np.concatenate(list(found.parameters.values())) - np.asarray(scene.phi).ravel()
+    assert 0.3 < errors @ np.linalg.solve(found.covariance, errors) / 20 < 2.0  # chi-square of 20; measured 0.96
 
 
 def test_estimates_scatter_as_the_bound_says(scene):
