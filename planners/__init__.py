@@ -10,6 +10,7 @@ from planners.certify import Certificate, certify
 from planners.compare import Table, compare
 from planners.driver import plan
 from planners.estimate import Estimate, estimate
+from planners.follow import after
 from planners.ik import Posture, inverse_kinematics
 from planners.measure import Measurements, measure
 from planners.monte_carlo import MonteCarlo, monte_carlo

@@ -32,7 +32,7 @@ import numpy as np
 import sdyn
 from planners import reach, sqp
 from planners.problem import Problem
-from planners.task import Task, TaskError
+from planners.task import Task, TaskError, written
 
 ITERATIONS = 150
 REACHED = 1e-6  # m, rad: error of inverse kinematics below which a posture is at the goal
@@ -199,21 +199,7 @@ def variant(task: Task, structure: Structure) -> Task:
     tree = tomllib.loads(task.source)
     tree["robot"] |= {"frame": structure.frame, "moving": list(structure.joints)}
     section = replace(task.robot, frame=structure.frame, moving=structure.joints)
-    return replace(task, chaser=chaser, robot=section, source=_toml(tree))
-
-
-def _toml(tree, name="") -> str:
-    """A task as TOML; what is nested deeper than its sections is inline."""
-    section = lambda key, x: isinstance(x, dict) and (not name or name == "phases")
-    plain = [f"{key} = {_value(x)}\n" for key, x in tree.items() if not section(key, x)]
-    deeper = [_toml(x, f"{name}.{key}" if name else key) for key, x in tree.items() if section(key, x)]
-    return "".join([f"[{name}]\n" if name else "", *plain, *deeper])
-
-
-def _value(x) -> str:
-    if isinstance(x, dict):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_value(y)}" for key, y in x.items()) + " }"
-    return json.dumps(x)
+    return replace(task, chaser=chaser, robot=section, source=written(tree))
 
 
 def _bounds(candidates, found) -> np.ndarray:

@@ -6,6 +6,7 @@ refused with the closest ones.
 
 import difflib
 import hashlib
+import json
 import tomllib
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
@@ -184,6 +185,20 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     chaser = _chaser(sections["robot"], folder)
     task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
     return _checked(_loaded(task, sought), folder)
+
+
+def written(tree: dict, name: str = "") -> str:
+    """The text of a task, from what TOML reads it as; what is nested deeper than its sections is inline."""
+    section = lambda key, x: isinstance(x, dict) and (not name or name == "phases")
+    plain = [f"{key} = {_value(x)}\n" for key, x in tree.items() if not section(key, x)]
+    deeper = [written(x, f"{name}.{key}" if name else key) for key, x in tree.items() if section(key, x)]
+    return "".join([f"[{name}]\n" if name else "", *plain, *deeper])
+
+
+def _value(x) -> str:
+    if isinstance(x, dict):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {_value(y)}" for key, y in x.items()) + " }"
+    return json.dumps(x)
 
 
 def _attitude(value):

@@ -78,6 +78,7 @@ def plan(
     solver: Annotated[str, arg(metavar="NAME")] = "sqp",
     seeds: int = 1,
     accuracy: Annotated[str, arg(metavar="fast|balanced|accurate|reference|ERROR")] = "balanced",
+    after: Folder = None,
 ) -> int:
     """Plan a task, certify the result, and write it with figures and an animation.
 
@@ -88,9 +89,12 @@ def plan(
         seeds: How many starting points to try; the worst are dropped early, the best certified result is kept.
         accuracy: How fine the solver's grid is: fast (half of the task's intervals), balanced, accurate (twice) or
             reference (four times); or a wanted error such as 1e-6, for the first of these that delivers it.
+        after: Folder of the plan of a grasp, at whose end a detumbling starts.
     """
     planners = _planners()
     wanted = planners.load(task)
+    if after is not None:
+        wanted = planners.after(_plan_in(after), wanted)
     folder = out or Path("out") / wanted.name
     if folder.exists() and not folder.is_dir():
         raise Failure(f"{folder} is a file; name a folder with --out.")

@@ -13,8 +13,8 @@ import planners
 import sdyn
 from planners import reach, sqp
 from planners.problem import Linear
-from planners.structures import REACHED, _bounds, _toml, dual_bound, variant
-from planners.task import parse
+from planners.structures import REACHED, _bounds, dual_bound, variant
+from planners.task import parse, written
 
 TEXT = """
 kind = "reach"
@@ -62,7 +62,7 @@ def test_every_way_to_lock_some_joints():
 @pytest.mark.parametrize("name", ["reach", "grasp", "identify"])
 def test_a_task_that_is_written_again_says_the_same(name):
     task = planners.load(name)
-    again = parse(_toml(tomllib.loads(task.source)), name)
+    again = parse(written(tomllib.loads(task.source)), name)
     for key in ("robot", "phases", "limits", "weights", "goal", "target", "sensors", "tolerance"):
         assert getattr(again, key) == getattr(task, key)
 
