@@ -15,6 +15,7 @@ from planners.ik import Posture, inverse_kinematics
 from planners.measure import Measurements, measure
 from planners.monte_carlo import MonteCarlo, monte_carlo
 from planners.plan import PhaseResult, Plan, PlanError
+from planners.sections import Goal
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study
 from planners.task import Task, TaskError, load

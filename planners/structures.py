@@ -1,4 +1,4 @@
-"""Which structure does a reach best: which frame to use, and which joints to lock.
+"""Which structure does a reach best: which frame to use, which joints to lock, and which of several goals to reach.
 
 All candidates are packed to one capacity, so that one compilation serves them: their problems differ in numbers only.
 Each starts from the straight motion to the cheapest posture that inverse kinematics finds, the most promising first. A
@@ -32,6 +32,7 @@ import numpy as np
 import sdyn
 from planners import reach, sqp
 from planners.problem import Problem
+from planners.sections import Goal
 from planners.task import Task, TaskError, written
 
 ITERATIONS = 150
@@ -46,6 +47,8 @@ class Structure:
 
     frame: str
     joints: tuple[str, ...]
+    goal: Goal | None = None
+    """Another than the task's: one of several places where a target can be grasped."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ class StructureChoice:
 
     def __str__(self) -> str:
         heads = ("frame", "locked", "status"), ("cost", "more", "time", "torque", "smooth", "T, s")
-        names = [(c.structure.frame, ", ".join(c.locked) or "none", c.status) for c in self.candidates]
+        names = [(_where(c.structure), ", ".join(c.locked) or "none", c.status) for c in self.candidates]
         numbers = [() if c.cost is None else self._numbers(c) for c in self.candidates]
         aligned = zip(_columns([heads[0], *names]), _columns([heads[1], *numbers], str.rjust), strict=True)
         why = ["", *(c.why for c in self.candidates)]
@@ -103,6 +106,12 @@ class StructureChoice:
         finite = lambda x: None if isinstance(x, float) and not np.isfinite(x) else x
         rows = [{k: finite(x) for k, x in asdict(c).items()} for c in self.candidates]
         return json.dumps({"candidates": rows}, indent=1)
+
+
+def _where(structure: Structure) -> str:
+    """The frame, and the place that it goes to, if it is not the task's."""
+    at = "" if structure.goal is None else f" to {', '.join(f'{x:g}' for x in structure.goal.position)}"
+    return structure.frame + at
 
 
 def _columns(rows, align=str.ljust) -> list[str]:
@@ -185,21 +194,26 @@ def _check(task, candidates):
     moving = [j.name for j in task.joints]
     if not candidates or not all(structure.joints for structure in candidates):
         raise TaskError("a candidate is missing or moves nothing; give Structure(frame, joints) with joints that move.")
-    for structure in candidates:
+    goals = [task.goal if structure.goal is None else structure.goal for structure in candidates]
+    if len({goal.quaternion is None for goal in goals}) > 1:
+        raise TaskError("some goals of the candidates have a quaternion and some have none; give it to all or to none.")
+    for structure, goal in zip(candidates, goals, strict=True):
         task.chaser.frame(structure.frame)
+        task.chaser.configuration(quaternion=goal.quaternion or (1.0, 0, 0, 0))  # refuses one that has not unit length
         for name in structure.joints:
             if name not in moving:
                 raise TaskError(f"joint {name!r} of a candidate rests in this task; {', '.join(moving)} move.")
 
 
 def variant(task: Task, structure: Structure) -> Task:
-    """The task with the structure's frame, and its joints alone."""
+    """The task with the structure's frame and goal, and its joints alone."""
     start = dict(zip([j.name for j in task.joints], task.start, strict=True))
     chaser = task.chaser.lock({name: q for name, q in start.items() if name not in structure.joints})
     tree = tomllib.loads(task.source)
     tree["robot"] |= {"frame": structure.frame, "moving": list(structure.joints)}
-    section = replace(task.robot, frame=structure.frame, moving=structure.joints)
-    return replace(task, chaser=chaser, robot=section, source=written(tree))
+    section, goal = replace(task.robot, frame=structure.frame, moving=structure.joints), structure.goal or task.goal
+    tree["goal"] = {key: x for key, x in asdict(goal).items() if x is not None}
+    return replace(task, chaser=chaser, robot=section, goal=goal, source=written(tree))
 
 
 def _bounds(candidates, found) -> np.ndarray:
@@ -207,7 +221,7 @@ def _bounds(candidates, found) -> np.ndarray:
     own = [x.cost[x.best] if x.error[x.best] <= REACHED else np.inf for x in found]
     return np.array([
         min(x for other, x in zip(candidates, own, strict=True)
-            if other.frame == one.frame and set(other.joints) <= set(one.joints))
+            if (other.frame, other.goal) == (one.frame, one.goal) and set(other.joints) <= set(one.joints))
         for one in candidates
     ])  # fmt: skip
 

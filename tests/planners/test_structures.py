@@ -34,6 +34,7 @@ time = 0.02
 smoothness = 20.0
 """
 TASK = parse(TEXT, "planar")
+HAND = planners.Structure("hand", ("joint1",))
 
 
 def large(*arms):
@@ -72,6 +73,16 @@ def test_a_variant_is_the_task_that_its_text_says():
     again = parse(task.source, "planar")
     assert again.robot == task.robot and repr(again.chaser) == repr(task.chaser)
     assert [j.name for j in task.joints] == ["joint1", "joint3"] and task.chaser.locked["joint2"][0] == 1.5
+
+
+def test_a_variant_may_have_another_goal():
+    """Its place and orientation are written too; the table says where each goes."""
+    goal = planners.Goal(position=(0.9, 0.2, 0.0), quaternion=(0.0, 1.0, 0.0, 0.0))
+    structure = planners.Structure("hand", ("joint1",), goal)
+    task = variant(TASK, structure)
+    assert task.goal == parse(task.source, "planar").goal == goal
+    out = planners.Candidate(structure, (), "unreachable", "", np.inf)
+    assert "hand to 0.9, 0.2, 0" in str(planners.StructureChoice(TASK, (out,)))
 
 
 def test_room_for_more_joints_changes_nothing():
@@ -141,12 +152,28 @@ def test_the_table_says_what_became_of_each_and_json_holds_it():
         ("reach", [], "missing"),
         ("reach", [planners.Structure("hand", ())], "moves nothing"),
         ("reach", [planners.Structure("hand", ("joint9",))], "'joint9' of a candidate rests"),
+        ("reach", [HAND, replace(HAND, goal=planners.Goal(position=(1.0, 0, 0)))], "to all or to none"),
+        ("reach", [replace(HAND, goal=planners.Goal(position=(1.0, 0, 0), quaternion=(1.0, 1, 0, 0)))], "quaternion"),
         ("reach", [planners.Structure("hant", ("joint1",))], "'hant'"),
     ],
 )
 def test_what_cannot_be_chosen_is_refused(task, candidates, words):
     with pytest.raises(ValueError, match=words):
         planners.choose_structure(planners.load(task), candidates)
+
+
+@pytest.mark.slow
+def test_the_best_of_two_places_is_found():
+    """The near one of two goals, without a compilation more than for one."""
+    places = [None, planners.Goal(position=(1.3, 0.2, 0.0)), planners.Goal(position=(9.0, 0.0, 0.0))]
+    planners.choose_structure(TASK, planners.lockings(TASK)[:1])
+    before = len(COMPILED)
+    candidates = [replace(planners.lockings(TASK)[0], goal=goal) for goal in places]
+    choices = [planners.choose_structure(TASK, candidates, drop=drop) for drop in (True, False)]
+    assert len(COMPILED) == before
+    assert choices[0].best.cost == choices[1].best.cost == min(c.cost for c in choices[1].candidates if c.cost)
+    assert choices[0].candidates[-1].status == "unreachable" and choices[0].candidates[-1].structure.goal is places[2]
+    assert choices[0].task.goal == (choices[0].best.structure.goal or TASK.goal)
 
 
 @pytest.fixture(scope="module")
