@@ -19,3 +19,4 @@ from planners.sections import Goal
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study
 from planners.task import Task, TaskError, load
+from planners.volumes import volume_ratios

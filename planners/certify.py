@@ -147,31 +147,46 @@ def _rate(chain, q0, state, tau):
     quat = _turn(q0[3:7], theta)
     q = jnp.concatenate([p, quat / jnp.linalg.norm(quat), joints])
     vdot = sdyn.forward_dynamics(chain, q, v, tau)
-    w, c = v[:3], jnp.cross(theta, v[:3])
+    w, c, x = v[:3], jnp.cross(theta, v[:3]), theta @ theta
     K = jnp.cross(quat[1:], v[3:6]) * 2  # rotates v[3:6] to the world
-    return w + c / 2 + jnp.cross(theta, c) / 12, v[3:6] + quat[0] * K + jnp.cross(quat[1:], K), v[6:], vdot
+    turning = w + c / 2 + (1 / 12 + x / 720 + x * x / 30240) * jnp.cross(theta, c)
+    return turning, v[3:6] + quat[0] * K + jnp.cross(quat[1:], K), v[6:], vdot
 
 
-STAGES = np.array([[0, 0, 1 / 6], [1 / 2, 1, 1 / 3], [1 / 2, 1, 1 / 3], [1, 2, 1 / 6]])  # of RK4: time, torque, weight
+STEP = 12  # intervals of a plan's grid, which one step of the integration takes
+PARTS = np.array([2, 4, 6, 12])  # substeps of the midpoint rule, all from grid point to grid point
+LIMITS = [np.prod([a * a / (a * a - b * b) for b in PARTS if b != a]) for a in PARTS]  # weights: to no length, order 8
+# one row for each use of the dynamics: grid point, length of the substep, whether it starts, factor of it, weight
+ROWS = np.array(
+    [
+        [STEP // n * k, 1 / n, k == 0, 1 if k == 0 else 2, limit / 2 if k == n else 0]
+        for n, limit in zip(PARTS, LIMITS, strict=True)
+        for k in range(n + 1)
+    ]
+)
 
 
 @jax.jit
 def integrate(chain, q, v, tau, steps):
-    """States [k + 1, nq], [k + 1, nv] from torques tau [k, 3, nv] at the start, middle and end of k steps [s]."""
+    """States [k + 1, nq], [k + 1, nv] from torques tau [k, STEP + 1, nv] along k steps [s].
+
+    Source: Gragg (1965), On extrapolation algorithms for ordinary initial value problems.
+    """
 
     def step(state, inputs):
         (q, v), (tau, h) = state, inputs
         start = (jnp.zeros(3), q[:3], q[7:], v)
-        along = lambda k, s: tuple(a + s * b for a, b in zip(start, k, strict=True))
 
-        def stage(carry, row):  # a loop: the dynamics are compiled once, not once a stage
-            k, total = carry
-            k = _rate(chain, q, along(k, h * row[0]), tau[row[1].astype(int)])
-            return (k, tuple(a + row[2] * b for a, b in zip(total, k, strict=True))), None
+        def use(carry, row):  # a loop: the dynamics are compiled once, not once a substep
+            before, now, end = carry
+            at, part, first, factor, weight = row
+            before, now = jax.tree.map(lambda a, b: jnp.where(first, a, b), (start, start), (before, now))
+            moved = jax.tree.map(lambda k: part * h * k, _rate(chain, q, now, tau[at.astype(int)]))
+            end = jax.tree.map(lambda a, b, c, d: a + weight * (b + c + d), end, before, now, moved)
+            return (now, jax.tree.map(lambda a, b: a + factor * b, before, moved), end), None
 
-        still = jax.tree.map(jnp.zeros_like, start)
-        (_, mean), _ = jax.lax.scan(stage, (still, still), jnp.asarray(STAGES))
-        theta, p, joints, v = along(mean, h)
+        (_, _, end), _ = jax.lax.scan(use, (start, start, jax.tree.map(jnp.zeros_like, start)), jnp.asarray(ROWS))
+        theta, p, joints, v = end
         quat = _turn(q[3:7], theta)
         new = jnp.concatenate([p, quat / jnp.linalg.norm(quat), joints]), v
         return new, new
@@ -184,12 +199,9 @@ def _integration(plan):
     """Largest differences between the plan and its motion integrated from the planned torques."""
     worst = dict.fromkeys(("place of the base", "attitude of the base", "joint positions", "velocities"), 0.0)
     capacity = sdyn.capacity([phase.robot for phase in plan.phases])
-    longest = max(len(phase.times) for phase in plan.phases) // 2
+    longest = max(len(phase.times) for phase in plan.phases) // STEP
     for phase in plan.phases:
-        (qs, vs), (coarse_q, coarse_v) = (_again(phase, capacity, longest, stride) for stride in (2, 4))
-        # what RK4 errs by falls 16 times from one to the other: to step zero, by Richardson
-        qs, vs = qs[::2] + (qs[::2] - coarse_q) / 15, vs[::2] + (vs[::2] - coarse_v) / 15
-        q, v = phase.q[::4], phase.v[::4]
+        (qs, vs), q, v = _again(phase, capacity, longest), phase.q[::STEP], phase.v[::STEP]
         turn = 2 * np.sqrt(np.maximum(0.0, _quat_distance(qs[:, 3:7], q[:, 3:7])))
         parts = (qs[:, :3] - q[:, :3], turn, qs[:, 7:] - q[:, 7:], vs - v)
         worst = {k: max(x, float(np.abs(part).max())) for (k, x), part in zip(worst.items(), parts, strict=True)}
@@ -202,16 +214,16 @@ def _quat_distance(a, b):
     return np.minimum(np.sum((a - b) ** 2, axis=1), np.sum((a + b) ** 2, axis=1))
 
 
-def _again(phase, capacity, longest, stride):
-    """One phase integrated with steps of `stride` intervals; padded with steps of no length to share one program."""
+def _again(phase, capacity, longest):
+    """One phase integrated; padded with steps of no length to share one program."""
     chain = sdyn.pack(phase.robot, capacity)
-    count = len(phase.times) // stride
+    count = len(phase.times) // STEP
     pad = lambda x: np.concatenate([x, np.zeros((longest - count, *x.shape[1:]))])
-    tau = np.stack([phase.tau[k : k + stride * count : stride] for k in (0, stride // 2, stride)], axis=1)
+    tau = np.stack([phase.tau[k : k + STEP * count : STEP] for k in range(STEP + 1)], axis=1)
     q, v = sdyn.pad(chain, phase.q[0], phase.v[0])
     width = np.shape(v)[-1] - tau.shape[-1]
     tau = np.pad(tau, ((0, 0), (0, 0), (0, width)))
-    qs, vs = integrate(chain, q, v, pad(tau), pad(np.diff(phase.times[::stride])))
+    qs, vs = integrate(chain, q, v, pad(tau), pad(np.diff(phase.times[::STEP])))
     return np.asarray(qs)[: count + 1, : phase.q.shape[1]], np.asarray(vs)[: count + 1, : phase.v.shape[1]]
 
 

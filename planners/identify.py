@@ -43,7 +43,7 @@ class Data(NamedTuple):
     rate: jax.Array  # [n]
     torque: jax.Array  # [n]
     margin: jax.Array  # []
-    attitude: jax.Array  # [] rad
+    attitude: jax.Array  # [] rad, largest turn of the base at the grid's points
     lever: jax.Array  # [3] m
     sensors: jax.Array  # [9 + n] sqrt(samples per second) / noise of the sensors' entries; zero if absent
     biased: jax.Array  # [9 + n] 1 for an entry with an unknown constant bias, else 0
@@ -145,7 +145,7 @@ def data(task: Task) -> Data:
         jnp.asarray(task.rate_limits),
         jnp.asarray(task.torque_limits),
         jnp.asarray(task.limits.margin),
-        jnp.asarray(task.attitude or 3.0),
+        jnp.asarray((task.attitude or 3.0) * (1 - task.limits.margin)),
         jnp.asarray(s.lever),
         entries(lambda name: 0.0 if noise[name] is None else np.sqrt(s.rate) / noise[name]),
         entries(lambda name: float(getattr(s, f"{name}_bias"))),
@@ -169,16 +169,20 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     return Problem(form, data(task), {"duration": low}, {"duration": high}, (), (*below, turn))
 
 
+def waves(rng, shape) -> np.ndarray:
+    """A random smooth motion from zero to zero, [points, n]: five sines for each joint, the higher ones less."""
+    s = np.linspace(0, 1, shape[0])[:, None]
+    return sum(rng.normal(size=shape[1]) * np.sin(np.pi * k * s) / k for k in range(1, 6))
+
+
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     """The best of some smooth random motions [count, n], scaled."""
     rng, form = np.random.default_rng(0), problem.form
     shape = form.blocks[1].shape
-    knots = np.linspace(0, 1, shape[0])[:, None]
     low, high = task.phases["excite"].duration
     guesses = []
     for _ in range(max(2 * count, 8)):
-        waves = sum(rng.normal(size=shape[1]) * np.sin(np.pi * k * knots) / k for k in range(1, 6))
-        swing = 0.12 * waves * task.rate_limits * high
+        swing = 0.12 * waves(rng, shape) * task.rate_limits * high
         inside = np.clip(task.start + swing, 0.9 * task.position_limits[:, 0], 0.9 * task.position_limits[:, 1])
         guesses.append(form.join({"duration": [(low + high) / 2], "excite": inside}))
     merits = [merit(summary(form, z, problem.data), PENALTIES[0]) for z in guesses]
@@ -197,10 +201,14 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
     return (PhaseResult("excite", task.chaser, at.times, q, at.v, tau),)
 
 
+def told(task: Task, problem: Problem, x: dict) -> np.ndarray:
+    """Fisher information [p, p] of a manoeuvre on the solver's grid, from the variables by name."""
+    return np.asarray(informed(problem.data, detailed(*_shape(task, 1.0), x, problem.data)))
+
+
 def results(task: Task, problem: Problem, x: dict) -> dict:
     """What the manoeuvre tells about the parameters."""
-    at = detailed(*_shape(task, 1.0), x, problem.data)
-    F = np.asarray(informed(problem.data, at))
+    F = told(task, problem, x)
     values, vectors = np.linalg.eigh(F)
     sees = values > GAP**2 * values[-1]
     names = [f"{body} {name}" for body in task.unknown for name in PARAMETERS]

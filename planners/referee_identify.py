@@ -106,5 +106,5 @@ def programme(task, problem, z) -> Programme:
     nlp.cost -= task.weights.information * (log_det()(F[:, -1]) + np.log(scale[diagonal]).sum())
     limit_joints(nlp, task, [P], [matrix(spline.hull(1)) @ P / T], [path.tau])
     versine = 2 * ca.sum1(path.quat[1:, :] ** 2) / ca.sum1(path.quat**2)  # 1 - cos of the base's turn
-    nlp.below(versine.T / (1 - np.cos(task.attitude or 3.0)) - 1, -np.inf, 0.0)
+    nlp.below(versine.T / (1 - np.cos(problem.data.attitude)) - 1, -np.inf, 0.0)
     return nlp

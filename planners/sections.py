@@ -184,7 +184,7 @@ class Limits:
     torque: float | None = number(0.0, default=None)
     """N m or N."""
     margin: float = number(0.0, 0.5, default=0.01)
-    """Part of the torque limit kept free at the grid's points, so that it holds between them too."""
+    """Part of the limits of torque and of the base's turn kept free at the grid's points, for what is between them."""
 
 
 @dataclass(frozen=True, kw_only=True)

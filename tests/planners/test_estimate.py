@@ -1,7 +1,6 @@
 """Estimating the parameters of base and load from simulated measurements, of a motion that nobody optimised."""
 
 import re
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -17,7 +16,7 @@ from planners.measure import NAMES, perfect, setup
 from planners.problem import ONCE
 from planners.task import parse
 
-TEXT = (Path(__file__).parents[1] / "data" / "identify_load.toml").read_text()
+TEXT = planners.load("identify_load").source.replace("intervals = 119", "intervals = 68")
 ENCODERS = "encoder = 1e-5 # rad\nencoder_bias = true\n"
 CHEAP = TEXT.replace("rate = 10.0", "rate = 2.72").replace(ENCODERS, "")
 
@@ -93,8 +92,7 @@ def test_the_planner_and_the_estimator_promise_the_same(scene):
 
 def test_a_bias_costs_what_the_schur_complement_over_it_costs(scene):
     data = scene.data._replace(biased=jnp.zeros_like(scene.data.biased))
-    shape = identify._shape(scene.task, 1.0)
-    at = identify.detailed(*shape, scene.x, data)
+    at = identify.detailed(*identify._shape(scene.task, 1.0), scene.x, data)
     S, h = np.asarray(jax.jit(identify.sensitivities, **ONCE)(data, at)), np.diff(at.times)
     known, biased = (identify.informed(d, at) for d in (data, scene.data))
     root = np.sqrt(np.r_[h[0], h[1:] + h[:-1], h[-1]] / 2)

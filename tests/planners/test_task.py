@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from planners.task import FOLDER, parse
 GRASP = (FOLDER / "grasp.toml").read_text()
 
 
-@pytest.mark.parametrize("name", ["grasp", "identify", "reach"])
+@pytest.mark.parametrize("name", ["grasp", "identify", "identify_load", "reach"])
 def test_shipped_tasks_load(name):
     task = planners.load(name)
     assert task.name == name and len(task.joints) == len(task.rate_limits) == len(task.start)
@@ -96,7 +94,7 @@ def test_bad_options_are_refused(option, words):
     ],
 )
 def test_a_bad_identification_is_refused(old, new, words):
-    source = (Path(__file__).parents[1] / "data" / "identify_load.toml").read_text()
+    source = planners.load("identify_load").source
     assert old in source
     with pytest.raises(ValueError) as error:
         parse(source.replace(old, new, 1))
