@@ -18,5 +18,6 @@ from planners.plan import PhaseResult, Plan, PlanError
 from planners.sections import Goal
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study
+from planners.table import PlanTable, table
 from planners.task import Task, TaskError, load
 from planners.volumes import volume_ratios

@@ -22,7 +22,14 @@ ITERATIONS = 150
 
 
 def plan(
-    task: Task, *, solver: str = "sqp", seeds: int = 1, accuracy: str | None = None, progress: bool = True
+    task: Task,
+    *,
+    solver: str = "sqp",
+    seeds: int = 1,
+    accuracy: str | None = None,
+    progress: bool = True,
+    guess: dict | None = None,
+    explain: bool = True,
 ) -> Plan:
     """Plans a task and certifies the result. The same call gives the same plan, bit by bit.
 
@@ -36,6 +43,9 @@ def plan(
             balanced if left out. Or a wanted error such as "1e-6": the first of these that is certified and whose
             motion, integrated again by other code, is that close to the plan [m, rad, m/s, rad/s].
         progress: Whether to show a live table.
+        guess: The variables of a similar task's plan to start from, instead of first guesses.
+        explain: Whether to look for what an infeasible task's constraints would have to give; it takes longer than a
+            plan.
 
     Returns:
         The plan. Its status is "solved", "infeasible" or "not converged", its verdict says so in a sentence.
@@ -43,9 +53,9 @@ def plan(
     Raises:
         TaskError: If an argument is none of these, or float64 is off.
     """
-    names, wanted = _checked(solver, seeds, accuracy)
+    names, wanted = _checked(solver, seeds, accuracy, guess)
     for name in names:
-        found = _planned(task, solver, seeds, name, progress)
+        found = _planned(task, solver, seeds, name, guess, explain, progress)
         error = found.certificate.worst("integrated again") if found.certificate else np.inf
         if len(names) == 1 or found.status == "infeasible" or (found.status == "solved" and error <= wanted):
             return found
@@ -55,7 +65,7 @@ def plan(
     return replace(found, status="not converged", verdict=f"{found.verdict} {said}")
 
 
-def _planned(task, solver, seeds, accuracy, progress) -> Plan:
+def _planned(task, solver, seeds, accuracy, guess, explain, progress) -> Plan:
     """The plan on one grid."""
     from planners.progress import Live
 
@@ -65,17 +75,27 @@ def _planned(task, solver, seeds, accuracy, progress) -> Plan:
         live.compiling("the task")
         problem = module.problem(task, fine)
         live.compiling("first guesses")
-        z = module.first_guesses(task, problem, seeds)
+        z = module.first_guesses(task, problem, seeds) if guess is None else _joined(problem.form, guess)
         ends, history = SOLVERS[solver](task, problem, z, live)
         live.compiling("the certificate")
         options = {"solver": solver, "seeds": seeds, "accuracy": accuracy, "fine": fine}
         info = {"options": options, "starts": dict(Counter(end.status for end in ends))}
         ends = [end for end in ends if end.status != "dropped"]
         found = _best(_result(task, problem, module, end, np.array(history), info) for end in ends)
-        if found.status == "infeasible" and solver == "sqp":
+        if found.status == "infeasible" and solver == "sqp" and explain:
             found = _explained(found, problem, ends[0], z[0], live)
     timing = {"compile_s": live.compile_s, "solve_s": time.monotonic() - began - live.compile_s}
     return replace(found, timing=timing)
+
+
+def _joined(form, guess) -> np.ndarray:
+    """Variables by name as the one first guess [1, n], scaled."""
+    for block in form.blocks:
+        if np.shape(guess.get(block.name)) != block.shape or not np.isfinite(guess[block.name]).all():
+            raise TaskError(
+                f"guess must hold {block.name!r}, finite numbers of the shape {block.shape}, as such a plan has."
+            )
+    return form.join(guess)[None]
 
 
 def _by_sqp(task, problem, z, live) -> tuple[list[Outcome], list]:
@@ -136,12 +156,14 @@ def _explained(found: Plan, problem, end: Outcome, guess, live) -> Plan:
     return replace(found, verdict=f"{found.verdict} {relax.sentence(needed)}", info=info)
 
 
-def _checked(solver, seeds, accuracy) -> tuple[tuple[str, ...], float]:
+def _checked(solver, seeds, accuracy, guess) -> tuple[tuple[str, ...], float]:
     """Names of the grids to try, and the error that ends it."""
     if solver not in SOLVERS:
         raise TaskError(f"there is no solver {solver!r}; this version has {', '.join(map(repr, SOLVERS))}.")
     if not isinstance(seeds, int) or seeds < 1:
         raise TaskError(f"seeds is {seeds!r}; it must be a whole number from 1.")
+    if guess is not None and seeds != 1:
+        raise TaskError(f"seeds is {seeds}, and a guess was given; a plan starts from the one or the other.")
     if not jax.config.jax_enable_x64:
         raise TaskError('planning needs float64; call jax.config.update("jax_enable_x64", True) first.')
     if accuracy is None or accuracy in ACCURACIES:

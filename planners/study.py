@@ -25,7 +25,7 @@ class StudyError(ValueError):
 
 
 def study(
-    folder, runs: dict[str, dict], work: Callable[[dict, np.random.Generator], dict], *, seed: int = 0
+    folder, runs: dict[str, dict], work: Callable[..., dict], *, seed: int = 0, chained: bool = False
 ) -> dict[str, dict[str, np.ndarray]]:
     """Do all runs that are not done yet.
 
@@ -35,6 +35,7 @@ def study(
         work: Of the parameters and a random generator, to {name: array}. The generator depends on the seed and the
             run's name alone, so a result does not know which runs were done before it, or in which process.
         seed: Of the study.
+        chained: Whether work takes a third argument, the results of the runs before this one in their order.
 
     Returns:
         {name: arrays} of all runs, in their order; the same bits whether or not the study was interrupted.
@@ -46,15 +47,16 @@ def study(
     folder.mkdir(parents=True, exist_ok=True)
     head = {"format": "sdyn-study", "version": 1, "seed": seed, "runs": _sum(json.dumps(runs).encode())}
     with _locked(folder):
-        done = _journal(folder, head)
+        done, out = _journal(folder, head), {}
         for name, parameters in runs.items():
             path = folder / f"{_sum(name.encode())[:16]}.npz"
             if name not in done or not path.is_file() or _sum(path.read_bytes()) != done[name]:
                 rng = np.random.default_rng([seed, int(_sum(name.encode())[:16], 16)])
-                data = _packed(work(parameters, rng))
+                data = _packed(work(parameters, rng, *([out] if chained else [])))
                 _put(path, data)
                 _append(folder, {"run": name, "file": path.name, "sha256": _sum(data)})
-        return {name: _arrays(folder / f"{_sum(name.encode())[:16]}.npz") for name in runs}
+            out[name] = _arrays(path)
+        return out
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """The small shipped grasp: planned twice, by both solvers, from several seeds; tasks of its shape that cannot be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,12 +55,38 @@ def test_the_default_solver_stays_where_the_referee_went(judged):
     assert abs(sqp.pick(first, 0).near.cost - judged.info["cost"]) < 1e-13  # of one point, measured 4e-16
 
 
+def spinning(task, spin):
+    return replace(task, target=replace(task.target, twist=(0.0, float(spin), 0.0, *task.target.twist[3:])))
+
+
+def test_plans_between_those_of_a_table_are_near_what_is_interpolated(plan, tmp_path):
+    """As near as is said there, and a few iterations away from a certified plan."""
+    spins = [[0.0305], [0.03], [0.031]]
+    table = planners.table(lambda point: spinning(plan.task, point[0]), spins, tmp_path)
+    assert table.solved == [0, 1, 2] and [entry.start for entry in table.entries] == [-1, 0, 0]
+    assert all(entry.certificate.passed for entry in table.entries)
+    assert abs(table.entries[1].cost - plan.info["cost"]) < 1e-6  # measured 4.8e-10
+    (check,) = table.check(1)
+    assert check.entry.status == "solved" and check.entry.iterations <= 10  # measured 6; from first guesses, 31
+    assert all(check.error[name] <= check.bound[name] for name in check.error)
+    assert check.error["durations"] < 0.01  # s, measured 1.0e-3
+    assert 0 < max(amount for _, amount, _ in check.violations) < 1e-4  # m, rad; measured 4.2e-5
+
+
 @pytest.mark.slow
 def test_a_wanted_error_decides_the_grid(plan):
     """The motion, integrated again by other code, is that close to the plan."""
     found = planners.plan(plan.task, accuracy="1e-7", progress=False)
     assert found.status == "solved" and found.certificate.worst("integrated again") <= 1e-7
     assert found.info["options"]["accuracy"] in ("fast", "balanced", "accurate", "reference")
+
+
+def test_a_guess_that_fits_no_plan_is_refused(plan):
+    for guess, words in (({}, "hold 'durations'"), (plan.variables | {"end": np.full(3, np.nan)}, "hold 'end'")):
+        with pytest.raises(planners.TaskError, match=words):
+            planners.plan(plan.task, guess=guess, progress=False)
+    with pytest.raises(planners.TaskError, match="seeds is 2, and a guess"):
+        planners.plan(plan.task, guess=plan.variables, seeds=2, progress=False)
 
 
 @pytest.mark.parametrize(
