@@ -14,6 +14,7 @@ from planners.follow import after
 from planners.ik import Posture, inverse_kinematics
 from planners.measure import Measurements, measure
 from planners.monte_carlo import MonteCarlo, monte_carlo
+from planners.outline import Outline, PhaseOutline, outline
 from planners.plan import PhaseResult, Plan, PlanError
 from planners.sections import Goal
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings

@@ -9,6 +9,7 @@ import os
 import sys
 import zipfile
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,7 +24,7 @@ from sdyn.files import FORMATS, load
 
 arg = tyro.conf.arg
 TaskWord = Annotated[str, tyro.conf.Positional, arg(metavar="TASK")]
-RobotWord = Annotated[str, tyro.conf.Positional, arg(metavar="ROBOT")]
+RobotOrTask = Annotated[str, tyro.conf.Positional, arg(metavar="ROBOT|TASK")]
 RobotOrPlan = Annotated[str, tyro.conf.Positional, arg(metavar="ROBOT|PLAN")]
 PlanWord = Annotated[Path, tyro.conf.Positional, arg(metavar="PLAN")]
 Folder = Annotated[Path | None, arg(metavar="DIR")]
@@ -107,16 +108,23 @@ def plan(
     return 0
 
 
-def show(robot: RobotWord, edit: Annotated[str, arg(metavar="EDITS")] = "", out: Folder = None) -> int:
-    """Show the structure of a robot, before and after edits.
+def show(what: RobotOrTask, edit: Annotated[str, arg(metavar="EDITS")] = "", out: Folder = None) -> int:
+    """Show a robot, before and after edits, or the phases of a task.
 
     Args:
-        robot: A shipped model, or the path of a .json or .urdf file.
-        edit: Edits, as in "lock joint1=0.3; reroot hand; ground hand". Also: unlock, release, close, open, attach,
-            detach.
-        out: Folder for a picture, structure.png.
+        what: A shipped model or task, or the path of a .json, .urdf or .toml file.
+        edit: Edits of a robot, as in "lock joint1=0.3; reroot hand; ground hand". Also: unlock, release, close, open,
+            attach, detach.
+        out: Folder for a picture: structure.png of a robot, phases.png of a task; out/TASK if left out for a task.
     """
-    before = _robot(robot)
+    if Path(what).suffix == ".toml" or what in _tasks():
+        if edit.strip():
+            raise Failure(f"edits are of robots, and {what} is a task; change its file.")
+        return _show_task(what, out)
+    try:
+        before = _robot(what)
+    except Failure as error:
+        raise Failure(f"{error} Or name a task: {', '.join(_tasks())}.") from None
     robots = {"before": before}
     if edit.strip():
         robots["after"], remarks = edits.edited(before, edit, _robot)
@@ -214,6 +222,47 @@ def _robot(name: str, **options):
         return models.load(name)
     except RobotError as error:
         raise Failure(f"{error} Or give the path of a {' or '.join(FORMATS)} file.") from None
+
+
+def _tasks() -> list[str]:
+    """The names of the shipped tasks; without loading the planners."""
+    return sorted(path.stem for path in (Path(find_spec("planners").origin).parent / "tasks").glob("*.toml"))
+
+
+def _show_task(name, out) -> int:
+    planners = _planners()
+    task = planners.load(name)
+    said = planners.outline(task)
+    stages = said.phases
+    least, most = (sum(stage.duration[k] for stage in stages) for k in (0, 1))
+    lasts = f"{least:g} s" if least == most else f"{least:g} to {most:g} s"
+    _say(f"{task.name}: {task.kind} in {len(stages)} phase{'s' * (len(stages) > 1)}, {lasts}")
+    table = Table.grid(padding=(0, 2))
+    for stage in stages:
+        low, high = stage.duration
+        heading = Text(stage.name, "bold"), Text(f"{low:g} s" if low == high else f"{low:g} to {high:g} s", "cyan")
+        table.add_row(*heading, Text(_in_short(stage.robot)))
+        more = {"apart": stage.apart and _in_short(stage.apart), "change": stage.change, "base": stage.base}
+        for title, text in (more | {"decided": stage.decided, "holds": "\n".join(stage.holds)}).items():
+            if text:
+                table.add_row("", Text(title, "dim"), Text(text))
+    table.add_row(Text("always", "bold"), Text("joints", "dim"), Text("\n".join(said.limits)))
+    table.add_row(Text("cost", "bold"), Text("sum of", "dim"), Text("\n".join(said.cost)))
+    console.print(table)
+    folder = out or Path("out") / task.name
+    folder.mkdir(parents=True, exist_ok=True)
+    robots = lambda stage: (stage.robot, *([stage.apart] if stage.apart else []))
+    parts = (drawing.Stage(stage.name, stage.duration, robots(stage), stage.change) for stage in stages)
+    drawing.save_stages(folder / "phases.png", tuple(parts))
+    _say(f"The picture is {folder / 'phases.png'}.")
+    return 0
+
+
+def _in_short(robot) -> str:
+    """Name, size and degrees of freedom."""
+    links, moving = len(robot.links), sum(joint.dof for joint in robot.moving)
+    size = f"{links} link{'s' * (links > 1)}; {robot.nv} degrees of freedom"
+    return f"{robot.name}: {size} (base {robot.nv - moving}, joints {moving})"
 
 
 def _view(caption, robot) -> list:

@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import planners
 import sdyn
 from sdyn import cli, edits
 from sdyn.cli import main
+
+TASKS = sorted(path.stem for path in planners.task.FOLDER.glob("*.toml"))
 
 
 @pytest.fixture(autouse=True)
@@ -82,6 +85,61 @@ def test_show_a_file(capsys, tmp_path):
     sdyn.save(sdyn.models.load("planar3"), tmp_path / "a.json")
     assert main(["show", str(tmp_path / "a.json")]) == 0
     assert "9 degrees of freedom" in capsys.readouterr().out
+
+
+# -- show a task -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_show_a_task(name, capsys, tmp_path):
+    """Its phases with their durations and what they hold, at 80 columns, and a picture."""
+    assert main(["show", name, "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for phase, section in planners.load(name).phases.items():
+        assert phase in out and f"{section.duration[1]:g} s" in out
+    for words in ("degrees of freedom (base 6", "holds", "torque at most", "duration", "phases.png"):
+        assert words in out
+    assert max(map(len, out[: out.index("The picture")].splitlines())) <= 80
+    assert (tmp_path / "phases.png").stat().st_size > 10_000
+
+
+def test_show_says_what_a_grasp_changes(capsys, tmp_path):
+    assert main(["show", "grasp", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    before, after = out.split("stabilise")
+    assert before.count("apart") == 3 and "8 links" in before and "change" not in before
+    assert "apart" not in after and "9 links" in after and "'hand' takes 'target_grasp'" in after
+
+
+def test_show_a_task_file(capsys, tmp_path, monkeypatch):
+    """The picture goes where the plan would go."""
+    (tmp_path / "mine.toml").write_text((planners.task.FOLDER / "reach.toml").read_text())
+    monkeypatch.chdir(tmp_path)
+    assert main(["show", "mine.toml"]) == 0
+    assert "mine: reach in 1 phase, 10 s" in capsys.readouterr().out
+    assert (tmp_path / "out" / "mine" / "phases.png").is_file()
+
+
+def test_robots_and_tasks_have_different_names():
+    """So that `show NAME` is clear."""
+    assert not set(TASKS) & set(sdyn.models.names())
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["show", "grsap"], ["'grsap'", "grasp", "deos7"]),
+        (["show", "missing.toml"], ["missing.toml"]),
+        (["show", "grasp", "--edit", "lock joint1=0"], ["edits are of robots", "grasp"]),
+    ],
+)
+def test_what_cannot_be_shown_is_one_sentence(argv, words, capsys):
+    assert main(argv) == 1
+    error = sentence(capsys)
+    assert all(word in error for word in words)
+
+
+# -- edits -------------------------------------------------------------------------------------------------------------
 
 
 def load(name):
