@@ -30,6 +30,7 @@ def plan(
     progress: bool = True,
     guess: dict | None = None,
     explain: bool = True,
+    iterations: int = ITERATIONS,
 ) -> Plan:
     """Plans a task and certifies the result. The same call gives the same plan, bit by bit.
 
@@ -46,6 +47,7 @@ def plan(
         guess: The variables of a similar task's plan to start from, instead of first guesses.
         explain: Whether to look for what an infeasible task's constraints would have to give; it takes longer than a
             plan.
+        iterations: Of the default solver, at most.
 
     Returns:
         The plan. Its status is "solved", "infeasible" or "not converged", its verdict says so in a sentence.
@@ -55,7 +57,7 @@ def plan(
     """
     names, wanted = _checked(solver, seeds, accuracy, guess)
     for name in names:
-        found = _planned(task, solver, seeds, name, guess, explain, progress)
+        found = _planned(task, solver, seeds, name, guess, explain, iterations, progress)
         error = found.certificate.worst("integrated again") if found.certificate else np.inf
         if len(names) == 1 or found.status == "infeasible" or (found.status == "solved" and error <= wanted):
             return found
@@ -65,18 +67,18 @@ def plan(
     return replace(found, status="not converged", verdict=f"{found.verdict} {said}")
 
 
-def _planned(task, solver, seeds, accuracy, guess, explain, progress) -> Plan:
+def _planned(task, solver, seeds, accuracy, guess, explain, iterations, progress) -> Plan:
     """The plan on one grid."""
     from planners.progress import Live
 
     fine, module = ACCURACIES[accuracy], importlib.import_module(f"planners.{task.kind}")
     began = time.monotonic()
-    with Live(task.name, seeds, show=progress, iterations=ITERATIONS, tolerance=sqp.FEASIBLE) as live:
+    with Live(task.name, seeds, show=progress, iterations=iterations, tolerance=sqp.FEASIBLE) as live:
         live.compiling("the task")
         problem = module.problem(task, fine)
         live.compiling("first guesses")
         z = module.first_guesses(task, problem, seeds) if guess is None else _joined(problem.form, guess)
-        ends, history = SOLVERS[solver](task, problem, z, live)
+        ends, history = SOLVERS[solver](task, problem, z, live, iterations)
         live.compiling("the certificate")
         options = {"solver": solver, "seeds": seeds, "accuracy": accuracy, "fine": fine}
         info = {"options": options, "starts": dict(Counter(end.status for end in ends))}
@@ -98,7 +100,7 @@ def _joined(form, guess) -> np.ndarray:
     return form.join(guess)[None]
 
 
-def _by_sqp(task, problem, z, live) -> tuple[list[Outcome], list]:
+def _by_sqp(task, problem, z, live, iterations) -> tuple[list[Outcome], list]:
     """Where all starts end, the best first, and the iterations of the best."""
     from threadpoolctl import threadpool_limits  # importing it sets an environment variable
 
@@ -107,14 +109,14 @@ def _by_sqp(task, problem, z, live) -> tuple[list[Outcome], list]:
     history = []
     # matrices of a few hundred rows: two threads of BLAS take twice the time of one, and far more on a busy machine
     with threadpool_limits(1, "blas"):
-        for states in sqp.solve(problem, z, iterations=ITERATIONS):
+        for states in sqp.solve(problem, z, iterations=iterations):
             best = states[sqp.ranking(states)[0]]
             history.append((len(history), float(best.near.cost), float(best.violation)))
             live.iteration(*history[-1], float(best.step), sqp.running(states))
     return [sqp.outcome(sqp.pick(states, k)) for k in sqp.ranking(states)], history
 
 
-def _by_ipopt(task, problem, z, live) -> tuple[list[Outcome], list]:
+def _by_ipopt(task, problem, z, live, _) -> tuple[list[Outcome], list]:
     """The same by the referee, one start after the other; of each, its end counts as an iteration."""
     from planners import referee
 

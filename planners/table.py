@@ -1,4 +1,4 @@
-"""Plans of many similar tasks, each started from the nearest one that is solved; what is between them is interpolated.
+"""Plans of many similar tasks, each from that of the nearest one that is solved; what is between them is interpolated.
 
     spins = np.linspace(0.02, 0.04, 5)[:, None]                      # [points, axes]
     table = planners.table(task_at, spins, "out/spins")              # task_at(point) -> Task
@@ -117,7 +117,7 @@ class PlanTable:
                 plan(tasks[k], guess=self.guess(chosen[k]).variables, explain=False, progress=False), NOWHERE
             )
 
-        found = study(self.folder / "check", _runs(chosen, tasks, range(len(tasks))), work)
+        found = study(self.folder / "check", _runs(chosen, tasks, range(len(tasks)), {}), work)
         return [self._checked(*each) for each in zip(chosen, tasks, map(_entry, found.values()), strict=True)]
 
     def _checked(self, point, task, entry) -> Check:
@@ -130,14 +130,23 @@ class PlanTable:
         return Check(point, error, bound, problem.worst(at.equal, at.below, 3), entry)
 
 
-def table(task_at: Callable[[np.ndarray], Task], points, folder, *, seeds: int = 1) -> PlanTable:
-    """Plans all points, each from the plan of the nearest one that is solved, else from first guesses.
+def table(
+    task_at: Callable[[np.ndarray], Task],
+    points,
+    folder,
+    *,
+    neighbours: int = 2,
+    seeds: int = 2,
+    iterations: int = 60,
+) -> PlanTable:
+    """Plans all points, each from the plan of the nearest one that is solved; where that leads to none, from others.
 
     Args:
         task_at: The task at a point [axes]. Tasks should differ in numbers only; then one compilation serves all.
         points: [count, axes], any part of a lattice. The first should be one that is easy to plan.
         folder: For the plans, a file each; made if it is not there. What is in it is not planned again.
-        seeds: First guesses of a point, where the neighbour's plan leads to none.
+        neighbours, seeds: Plans of the nearest solved points, then first guesses, that are tried one after the other.
+        iterations: Of the solver, for each of them, at most.
 
     Raises:
         StudyError: If the folder holds another table, or is in use.
@@ -145,25 +154,45 @@ def table(task_at: Callable[[np.ndarray], Task], points, folder, *, seeds: int =
     lattice = Lattice(points)
     tasks = [task_at(point) for point in lattice.points]
 
-    def work(parameters, rng, before):
-        k = parameters["number"]
+    def starts(task, k, before):
         near = [int(j) for j, found in before.items() if found["status"] == "solved"]
-        if near:
-            start = min(near, key=lattice.distances(k).__getitem__)
-            found = plan(tasks[k], guess=_entry(before[str(start)]).variables, explain=False, progress=False)
-            if found.status == "solved":
-                return _arrays(found, start)
-        return _arrays(plan(tasks[k], seeds=seeds, explain=False, progress=False), NOWHERE)
+        for j in sorted(near, key=lattice.distances(k).__getitem__)[:neighbours]:
+            yield j, _entry(before[str(j)]).variables
+        for guess in _first_guesses(task, seeds):
+            yield NOWHERE, guess
 
-    found = study(folder, _runs(lattice.points, tasks, lattice.order, seeds), work, chained=True)
+    def work(parameters, rng, before):
+        k, best = parameters["number"], None
+        for start, guess in starts(tasks[k], k, before):
+            found = plan(tasks[k], guess=guess, iterations=iterations, explain=False, progress=False)
+            if best is None or _rank(found) < _rank(best[0]):
+                best = found, start
+            if found.status == "solved":
+                break
+        return _arrays(*best)
+
+    options = {"neighbours": neighbours, "seeds": seeds, "iterations": iterations}
+    found = study(folder, _runs(lattice.points, tasks, lattice.order, options), work, chained=True)
     entries = tuple(_entry(found[str(k)]) for k in range(len(tasks)))
     return PlanTable(task_at, lattice, entries, Path(folder))
 
 
-def _runs(points, tasks, order, seeds=1) -> dict[str, dict]:
+def _first_guesses(task, count) -> list[dict]:
+    """First guesses by name, physical units."""
+    module = importlib.import_module(f"planners.{task.kind}")
+    problem = module.problem(task)
+    return [problem.form.split(z) for z in module.first_guesses(task, problem, count)]
+
+
+def _rank(found: Plan):
+    """Of two plans the better one has less: solved, then the one that violates less."""
+    return found.status != "solved", float(found.history[-1][2])
+
+
+def _runs(points, tasks, order, options) -> dict[str, dict]:
     """The runs of a study: a folder is refused if any number of any of its tasks has changed."""
     task = lambda k: hashlib.sha256(repr(tasks[k]).encode()).hexdigest()
-    return {str(k): {"number": k, "point": points[k].tolist(), "task": task(k), "seeds": seeds} for k in order}
+    return {str(k): {"number": k, "point": points[k].tolist(), "task": task(k)} | options for k in order}
 
 
 def _arrays(found: Plan, start: int) -> dict:

@@ -42,38 +42,48 @@ def calls(monkeypatch):
     """Planning of what is made up; all calls, as (point, guess)."""
     out = []
 
-    def plan(task, *, seeds=1, guess=None, explain, progress):
+    def plan(task, *, guess, iterations=150, explain, progress):
         assert not explain and not progress
-        out.append((task.point, None if guess is None else tuple(guess["x"][:2]), seeds))
-        good = task.point != LOST and (task.point != HARD or guess is None)
-        x = {"x": np.array([*task.point, 0.0 if guess is None else guess["x"][2] + np.pi / 7])}
+        *start, seen = guess["x"]
+        out.append((task.point, tuple(start), iterations))
+        good = task.point != LOST and (task.point != HARD or np.isnan(start[0]))
+        x = {"x": np.array([*task.point, seen + np.pi / 7])}
         certificate = Certificate((Row("something", 1e-9, 1e-6, "m"),)) if good else None
-        status, history = "solved" if good else "infeasible", np.array([[0, 1, 1], [len(out) > 0, 1, 0]])
+        status, history = "solved" if good else "infeasible", np.array([[0, 1, 1], [1, 1, np.nansum(start)]])
         return planners.Plan(task, (), status, status, x, {}, history, {}, {"cost": sum(task.point)}, certificate)
 
     monkeypatch.setattr(module, "plan", plan)
+    monkeypatch.setattr(
+        module, "_first_guesses", lambda task, count: [{"x": np.array([np.nan, k, 0])} for k in range(count)]
+    )
     return out
 
 
 def test_each_plan_starts_from_the_nearest_that_is_solved(calls, tmp_path):
-    table = planners.table(task_at, POINTS, tmp_path, seeds=3)
+    table = planners.table(task_at, POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
     assert [entry.status for entry in table.entries].count("solved") == len(table.solved) == 8
-    assert calls[0] == (tuple(POINTS[0]), None, 3)
-    starts = {point: guess for point, guess, _ in calls if guess}
-    assert set(starts) == set(map(tuple, POINTS[1:])) and LOST not in starts.values()
-    assert all(np.abs(np.subtract(p, g) / [1, 5]).sum() == 1 for p, g in starts.items())
-    again = [point for point, guess, seeds in calls[1:] if guess is None and seeds == 3]
-    assert again == [HARD, LOST]
-    for k, (point, entry) in enumerate(zip(POINTS, table.entries, strict=True)):
-        assert tuple(entry.variables["x"][:2]) == tuple(point) and entry.cost == point.sum() and entry.iterations == 1
-        hard = k == 0 or tuple(point) in (HARD, LOST)
-        assert entry.start == (-1 if hard else POINTS.tolist().index(list(starts[tuple(point)])))
-        assert (entry.certificate is None) == (tuple(point) == LOST)
+    assert {count for _, _, count in calls} == {9}
+    guess = lambda start: "first guess" if np.isnan(start[0]) else start
+    tried = {p: [guess(start) for point, start, _ in calls if point == p] for p in map(tuple, POINTS)}
+    assert tried[tuple(POINTS[0])] == ["first guess"]
+    far = lambda point, start: np.linalg.norm(np.subtract(point, start) / [1, 5])
+    for point, entry in zip(map(tuple, POINTS), table.entries, strict=True):
+        starts = [start for start in tried[point] if start != "first guess"]
+        assert LOST not in starts and len(set(starts)) == len(starts)
+        assert [far(point, start) for start in starts] == sorted(far(point, start) for start in starts)
+        assert not starts or far(point, starts[0]) == 1
+        if point in (HARD, LOST):
+            assert tried[point][-1] == "first guess" and len(starts) == 2
+            assert len(tried[point]) == (3 if point == HARD else 5)
+        assert tuple(entry.variables["x"][:2]) == point and entry.cost == sum(point) and entry.iterations == 1
+        nowhere = not starts or point in (HARD, LOST)
+        assert entry.start == (-1 if nowhere else POINTS.tolist().index(list(starts[0])))
+        assert (entry.certificate is None) == (point == LOST)
     count = len(calls)
-    again = planners.table(task_at, POINTS, tmp_path, seeds=3)
+    again = planners.table(task_at, POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
     assert len(calls) == count and str(again.entries) == str(table.entries)
     with pytest.raises(planners.StudyError, match="another"):
-        planners.table(lambda point: Made(tuple(point), 2.0), POINTS, tmp_path, seeds=3)
+        planners.table(lambda point: Made(tuple(point), 2.0), POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
 
 
 def test_between_solved_points_there_are_guesses(calls, tmp_path):
