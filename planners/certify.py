@@ -65,7 +65,7 @@ class Certificate:
         touched = f"; it touches {', '.join(self.active)}" if self.active else ""
         if bad:
             return f"Not certified: {'; '.join(bad)}."
-        return f"Certified: {len(self.rows)} checks passed on a grid twelve times finer than the solver's{touched}."
+        return f"Certified: {len(self.rows)} checks passed on a grid 24 times finer than the solver's{touched}."
 
     def __str__(self) -> str:
         width = max(len(row.name) for row in self.rows)

@@ -17,7 +17,7 @@ from planners.problem import Outcome
 from planners.task import Task, TaskError
 
 ACCURACIES = {"fast": 0.5, "balanced": 1.0, "accurate": 2.0, "reference": 4.0}  # multiples of the task's intervals
-FINE = 12  # the output's grid, relative to the solver's: one step of the certificate's integration
+FINE = 24  # the output's grid, relative to the solver's: two steps of the certificate's integration
 ITERATIONS = 150
 
 

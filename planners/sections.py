@@ -172,7 +172,7 @@ class Phase:
     control_points: int = number(7, 60, default=12, whole=True)
     """Of the quintic spline of every joint."""
     intervals: int = number(4, 400, default=24, whole=True)
-    """Of the solver's grid; the certificate's is twelve times finer."""
+    """Of the solver's grid; the certificate's is 24 times finer."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from planners.measure import NAMES, perfect, setup
 from planners.problem import ONCE
 from planners.task import parse
 
-TEXT = planners.load("identify_load").source.replace("intervals = 119", "intervals = 68")
+TEXT = planners.load("identify_load").source
 ENCODERS = "encoder = 1e-5 # rad\nencoder_bias = true\n"
 CHEAP = TEXT.replace("rate = 10.0", "rate = 2.72").replace(ENCODERS, "")
 

@@ -28,7 +28,7 @@ def test_the_grasp_is_planned_and_certified(plan):
 
 
 @pytest.mark.parametrize(
-    ("check", "bound"),  # on a grid twelve times finer than the solver's; SI units; measured values behind
+    ("check", "bound"),  # on a grid 24 times finer than the solver's; SI units; measured values behind
     [
         ("excess over position limits", 1e-6),  # 0
         ("excess over rate limits", 1e-6),  # 0
