@@ -3,7 +3,10 @@
 Each iteration solves one elastic programme (`qp`) in a box around the point. The curvature is Gauss-Newton plus a
 symmetric rank-one correction that learns, from short steps, what Gauss-Newton leaves out (the constraints'
 curvature); negative directions are mirrored. A step that does not pay is first bent (second-order correction), then
-shortened. The penalty grows only where the linearised constraints gain by it.
+shortened. The penalty grows only where the linearised constraints gain by it. Once steps are short, Newton's step on
+the constraints that hold is tried first (`newton`), and taken where it halves the residual of the conditions of
+optimality: the curvature is then that of the constraints' null space, unmirrored, no trust region's barrier bends it,
+and what the merit gains, which drowns in rounding, is not asked.
 
 The loop runs on the host, so that it can be watched; three compiled functions do the work, for one start, so that one
 start and many share them. Several starts take turns, one iteration each. After TRIAL iterations they are compared by
@@ -22,17 +25,19 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from planners import qp
+from planners import newton, qp
 from planners.problem import Form, Linear, Outcome, Problem, summary
 
 FEASIBLE = 1e-9  # scaled violation
-STATIONARY = 1e-6  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
+STATIONARY = 1e-8  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
 ENOUGH = 1e-4  # the same, where rounding lets nothing more be gained
+CLOSE = 1e-3  # scaled violation from which on Newton's step on the constraints that hold is tried
 PENALTIES = (10.0, 1e5)  # first and largest
 LENGTHS = 0.5 ** np.arange(8.0)
 WORTH = 0.1  # part of the predicted decrease that a step must bring
 NOISE = 1e-10  # relative change of the merit that says nothing: steps within it are taken, or the radius would collapse
-LEARN_BELOW = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
+SHORT = 0.02  # scaled step; longer ones would teach the curvature of elsewhere
+TEACHES = 1e-2  # least cosine of a step and the change it teaches; a smaller one would become an enormous curvature
 RADII = (1e-6, 0.1, 2.0)  # trust region, scaled variables: smallest, at least after a larger penalty, largest
 WIDE = 1e3  # scaled: a trust region that is none
 STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more penalty, one gained is worth it
@@ -185,8 +190,8 @@ def learn(S, old: Linear, new: Linear, step, y, u):
     gradient = lambda x: x.gradient + y @ x.A + u @ x.C
     miss = gradient(new) - gradient(old) - new.curvature @ step - S @ step
     size = miss @ step
-    well = jnp.abs(size) > 1e-8 * jnp.linalg.norm(miss) * jnp.linalg.norm(step)
-    well = well & (jnp.abs(step).max() <= LEARN_BELOW)
+    well = jnp.abs(size) > TEACHES * jnp.linalg.norm(miss) * jnp.linalg.norm(step)
+    well = well & (jnp.abs(step).max() <= SHORT)
     return S + jnp.where(well, jnp.outer(miss, miss) / jnp.where(well, size, 1.0), 0.0)
 
 
@@ -274,8 +279,32 @@ def _marked(s: State, status) -> State:
 
 def _iterated(form, s: State, numbers) -> State:
     """The state after one iteration."""
+    if s.iteration and s.violation <= CLOSE and s.step <= SHORT:
+        new = _polished(form, s, numbers)
+        if new is not None and residual(new) <= residual(s) / 2:
+            return new
     step = _steered(s, *numbers[1:])
     return _arrive(form, s, step, search(form, s, step, numbers), numbers)
+
+
+def residual(s: State) -> float:
+    """What a state lacks to the conditions of optimality."""
+    return max(float(s.violation), float(s.stationarity))
+
+
+def _polished(form, s: State, numbers) -> State | None:
+    """The state after Newton's step on the constraints that hold; None without one that is short."""
+    _, low, high = numbers
+    near, z, y, u = (jax.tree.map(np.asarray, x) for x in (s.near, s.z, s.y, s.u))
+    found = newton.step(near, near.curvature + s.left_out, z, y, u, low, high)
+    if found is None:  # what was learnt farther away is not the curvature of a minimum
+        s = s._replace(left_out=np.zeros_like(near.curvature))
+        found = newton.step(near, near.curvature, z, y, u, low, high)
+    if found is None or np.abs(found[0]).max() > SHORT:
+        return None
+    d, y, u = found
+    step = Step(d, y, u, np.asarray(s.penalty), *np.zeros(4))
+    return _arrive(form, s, step, Found(np.clip(z + d, low, high), np.float64(1), np.float64(np.inf)), numbers)
 
 
 def _compared(states) -> list[State]:
