@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from planners import solids
 from planners.motion import continuous, follow, quaternions, rotations
-from planners.shapes import ORANGE, extent, robot_shapes
+from planners.shapes import ORANGE, extent, keep_out, robot_shapes
 
 FRAMES_PER_SECOND = 25.0
 MAX_FRAMES = 1500  # of a long plan; what is slow looks smooth with fewer
@@ -123,6 +124,8 @@ def _shapes(plan) -> dict:
         shapes = {**robot_shapes(phase.robot), **shapes}
     if plan.task.body:
         shapes |= robot_shapes(plan.task.body, ORANGE, panels=True)
+    for solid in plan.task.shapes.values():
+        shapes[solid.link] = [*shapes[solid.link], *keep_out(solid)]
     return shapes
 
 
@@ -200,6 +203,8 @@ def _add(scene, name, shape):
         scene.add_cylinder(name, radius=shape.size[0], height=shape.size[1], **look, **place)
     elif shape.kind == "ball":
         scene.add_icosphere(name, radius=shape.size[0], **look, **place)
+    elif shape.kind == "ellipsoid":
+        scene.add_icosphere(name, scale=shape.size, **look, **place)
     else:
         scene.add_frame(name, axes_length=shape.size[0], axes_radius=0.06 * shape.size[0], **place)
 
@@ -208,7 +213,15 @@ def _labels(scene, plan, middle, top) -> list:
     """A label for each phase, above the scene; it is shown in its phase only."""
     look = {"position": (*middle, top), "anchor": "bottom-center", "font_screen_scale": 1.5, "visible": False}
     spans = [f"{phase.name}, {phase.times[0]:.1f} to {phase.times[-1]:.1f} s" for phase in plan.phases]
+    if plan.task.clearance:
+        spans = [f"{text}, clearance {d:.3f} m" for text, d in zip(spans, _closest(plan), strict=True)]
     return [scene.add_label(f"/phase {k}", text, **look) for k, text in enumerate(spans)]
+
+
+def _closest(plan):
+    """Least distance in each phase of the shapes that are not in contact."""
+    kept = solids.least(plan.task) == plan.task.clearance.distance
+    return [solids.apart(plan.task, *pair)[:, kept].min() for pair in follow(plan)]
 
 
 def _play(recorder, times, motion, nodes, labels, masks):

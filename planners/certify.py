@@ -33,6 +33,8 @@ class Row:
     value: float
     bound: float
     unit: str
+    touched: str = ""
+    """Limit that the plan touches there, in words."""
 
     @property
     def ok(self) -> bool:
@@ -98,7 +100,7 @@ def certify(task, plan) -> Certificate:
     rows, active = _limits(task, plan)
     module = importlib.import_module(f"planners.certify_{task.kind}")
     rows += _integration(plan) + module.rows(task, plan) + [stationarity(task, plan)]
-    return Certificate(tuple(rows), tuple(active))
+    return Certificate(tuple(rows), (*active, *(row.touched for row in rows if row.touched)))
 
 
 def _limits(task, plan):

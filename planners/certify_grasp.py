@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 import sdyn
+from planners import certify_mission
 from planners.certify import DRIFT, INTEGRATION, LIMIT, MOMENTUM, Row, largest, see
 from planners.problem import ONCE
 
@@ -15,11 +16,13 @@ def rows(task, plan) -> list[Row]:
     movers = [(phase.robot, hand, phase.q, phase.v) for phase in plan.phases]
     seen = see([*movers, *((body, grip, q, v) for body, q, v in (phase.passive for phase in alone))])
     robots, targets = seen[: len(plan.phases)], seen[len(plan.phases) :]
+    gap, impulse = _transfer(plan)
     return [
         *_ends(task, plan),
         *_tracking(task.tolerance, robots[len(alone) - 1], targets[-1]),
         *_momentum(robots, targets),
-        *_transfer(plan),
+        Row("state after the grasp differs from the jump", gap, 10 * INTEGRATION, "m, rad, m/s, rad/s"),
+        *certify_mission.rows(task, plan, impulse),
     ]
 
 
@@ -83,10 +86,13 @@ _jump = jax.jit(sdyn.transfer, **ONCE)
 
 
 def _transfer(plan):
-    """The state after the grasp against the momentum-consistent jump of the full systems."""
+    """The momentum-consistent jump of the full systems at the grasp: how far the state is from it, and the impulsive
+    wrench [6] on the target, world axes, about its base's origin.
+    """
     before, after = plan.phases[-2], plan.phases[-1]
     body, q, v = before.passive
     chains = sdyn.pack(before.robot), sdyn.pack(body)
-    _, q_new, v_new, _ = _jump(chains, sdyn.pack(after.robot), (before.q[-1], q[-1]), (before.v[-1], v[-1]))
+    _, q_new, v_new, impulse = _jump(chains, sdyn.pack(after.robot), (before.q[-1], q[-1]), (before.v[-1], v[-1]))
     gap = max(np.abs(np.asarray(q_new) - after.q[0]).max(), np.abs(np.asarray(v_new) - after.v[0]).max())
-    return [Row("state after the grasp differs from the jump", float(gap), 10 * INTEGRATION, "m, rad, m/s, rad/s")]
+    target = [link.name for link in after.robot.links].index(body.base)
+    return float(gap), np.asarray(impulse)[target]

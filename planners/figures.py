@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 import sdyn
+from planners import solids
 from planners.motion import continuous, follow, quaternions
 
 BLUE, RED, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#A0A0A0"  # Okabe and Ito's palette
@@ -35,6 +36,8 @@ def draw(plan, folder) -> list[Path]:
     figures |= {"base": base(plan, motions), "momentum": momenta(plan, motions)}
     if plan.task.kind == "grasp":
         figures["grasp"] = grasp(plan, motions)
+        if plan.task.clearance:
+            figures["clearance"] = clearance(plan, motions)
     if plan.task.kind == "detumble":
         figures["wrench"] = wrench(plan)
     if plan.task.kind == "identify":
@@ -219,6 +222,21 @@ def grasp(plan, motions) -> Figure:
             panel.hlines(most, tracking[0].times[0], tracking[0].times[-1], color=RED, linestyle="--", linewidth=1.2)
         low, high = panel.get_ylim()
         panel.set_ylim(max(low, 1e-9 * high), high)
+    return figure
+
+
+def clearance(plan, motions) -> Figure:
+    """Distance of every pair of shapes that keep apart, and the least that it may be."""
+    task = plan.task
+    names, least = solids.pairs(task), solids.least(task)
+    figure, panels = _sheet(plan, "Clearance", len(names), dashed="least")
+    curves = [solids.apart(task, *pair) for pair in motions]
+    for k, (panel, (a, b)) in enumerate(zip(panels, names, strict=True)):
+        for phase, values in zip(plan.phases, curves, strict=True):
+            panel.plot(phase.times, values[:, k], color=BLUE, linewidth=1.3)
+        panel.axhline(least[k], color=RED, linestyle="--", linewidth=1.0)
+        panel.set_title(f"{a} from {b}: at least {min(x[:, k].min() for x in curves):.3f} m", fontsize=9, loc="left")
+        panel.set_ylabel("m", fontsize=8)
     return figure
 
 

@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
-from planners import floating
+from planners import floating, mission
 from planners.bspline import Clamped
 from planners.floating import Momentum, Motion, Tumble, path_quaternions
 from planners.joints import effort, limit_rows, two_sided, within
 from planners.plan import PhaseResult
-from planners.problem import ONCE, Block, Form, Problem, Rows, Values
+from planners.problem import ONCE, Block, Form, Problem, Rows, Values, summary
 from planners.task import Task
 
 MOVING = ("approach", "track", "stabilise")
+CANDIDATES = 24  # first guesses of which those that keep clear best are taken
 TABLE_STEP = 0.1  # s; Munthe-Kaas RK4 at the tumble rates of satellites errs by less than 1e-12 rad a minute
 
 
@@ -42,6 +43,7 @@ class Data(NamedTuple):
     margin: jax.Array  # [] part of the torque kept free
     speed: jax.Array  # [] tolerance while tracking, rad/s and m/s
     weights: jax.Array  # [3] time, torque, smoothness
+    mission: mission.Mission | None  # what is asked besides
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,7 @@ class Grasp:
         below = (
             within(data, *map(jnp.concatenate, (P, rates, [at.tau for at in motions]))),
             two_sided(jnp.concatenate([spin, slide], axis=1), -data.speed / 2, data.speed / 2),
+            *mission.below(data, T[0], motions),
         )
         return Values(
             data.weights[0] * T.sum(),
@@ -195,7 +198,7 @@ class Grasp:
         )
 
 
-def rows(task: Task, grid: Grid, poses):
+def rows(task: Task, grid: Grid, poses, fine: float):
     """Names of the constraint rows: (equalities, inequalities), in the order of `values`."""
     hand, grip = task.robot.frame, task.target.frame
     equal = (
@@ -206,10 +209,11 @@ def rows(task: Task, grid: Grid, poses):
     )
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
     steady = Rows("velocity while tracking", 1.0, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
-    return equal, (*limit_rows(task, points, points - 3, torques), steady)
+    limits = limit_rows(task, points, points - 3, torques)
+    return equal, (*limits, steady, *mission.rows(task, fine, grid.intervals))
 
 
-def data(task: Task) -> Data:
+def data(task: Task, fine: float = 1.0) -> Data:
     """The numbers of a task."""
     chaser, body = task.chaser, task.body
     resting = chaser.lock(dict(zip([j.name for j in task.joints], task.start, strict=True)))
@@ -236,6 +240,7 @@ def data(task: Task) -> Data:
         jnp.asarray(task.limits.margin),
         jnp.asarray(task.tolerance.speed),
         np.array([w.time, w.torque, w.smoothness]),
+        mission.of(task, fine),
     )
 
 
@@ -306,15 +311,23 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
         *(Block(name, (s.count - 6, n)) for name, s in zip(MOVING, grid.splines, strict=True)),
     )
     form = Form(blocks, Grasp(grid, task.robot.frame, tuple(map(int, poses))))
-    return Problem(form, data(task), {"durations": low}, {"durations": high}, *rows(task, grid, poses))
+    return Problem(form, data(task, fine), {"durations": low}, {"durations": high}, *rows(task, grid, poses, fine))
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
-    """First guesses [count, n], scaled."""
+    """First guesses [count, n], scaled; of a mission that asks for more than limits, those that lack least of it."""
     from planners import seeds
 
     form = problem.form
-    return np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, count)])
+    more = count if task.clearance is None else max(count, CANDIDATES)
+    z = np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, more)])
+    if more == count:
+        return z
+    names = [rows.name for rows in problem.below]
+    sizes = np.array([rows.size for rows in problem.below])
+    kept = np.repeat([name.startswith("clearance of") for name in names], sizes)
+    lack = [np.maximum(summary(form, x, problem.numbers[0]).below[kept], 0).sum() for x in z]
+    return z[np.argsort(lack, kind="stable")[:count]]
 
 
 def results(task: Task, problem: Problem, x: dict) -> dict:

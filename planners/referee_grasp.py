@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from planners import grasp, symbolic
+from planners import grasp, referee_mission, symbolic
 from planners.collocation import (
     Drift,
     base_of,
@@ -105,4 +105,6 @@ def programme(task, problem, z) -> Programme:
         nlp.equal(rows[:, where])
     limit_joints(nlp, task, points, rates, [path.tau for path in paths])
     nlp.below(e[6:, :].T, -task.tolerance.speed / 2, task.tolerance.speed / 2)
+    scene = referee_mission.Scene(alone, target, compound, attitude, paths, wait, T)
+    referee_mission.limit(nlp, task, scene)
     return nlp

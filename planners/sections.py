@@ -88,6 +88,18 @@ def names():
     return field(default=(), metadata={"check": check})
 
 
+def pairs_of_names():
+    """A field that holds a list of pairs of names."""
+
+    def check(value, where):
+        pair = lambda x: isinstance(x, list) and len(x) == 2 and all(isinstance(name, str) for name in x)
+        if not isinstance(value, list) or not all(map(pair, value)):
+            raise TaskError(f'{where} is {value!r}; it must look like [["forearm", "bus"], ["wrist", "bus"]].')
+        return tuple(map(tuple, value))
+
+    return field(default=(), metadata={"check": check})
+
+
 @dataclass(frozen=True, kw_only=True)
 class Chaser:
     """Section [robot]: who does it, and how it starts, at rest."""
@@ -113,6 +125,8 @@ class Passive:
     """wxyz, body to world."""
     twist: tuple = vector(6)
     """[w; v] of the base origin, body axes [rad/s, m/s]."""
+    uncertainty: float = number(0.0, 0.5, default=0.0)
+    """Part by which mass and inertia may be others; the certificate then looks at the torques after the grasp."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,7 +198,7 @@ class Limits:
     torque: float | None = number(0.0, default=None)
     """N m or N."""
     margin: float = number(0.0, 0.5, default=0.01)
-    """Part of the limits of torque and of the base's turn kept free at the grid's points, for what is between them."""
+    """Part kept free at the grid's points, of limits of torque, base, gripper and sight, for what is between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,6 +211,74 @@ class Tolerance:
     """rad."""
     speed: float = number(0.0, default=1e-3)
     """m/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solid:
+    """Section [shapes.NAME]: a sphere, a capsule or an ellipsoid on a link; places and axes are the link's."""
+
+    link: str = text()
+    """Of the robot; or of the target, with "target_" before its name."""
+    position: tuple = vector(3)
+    """Centre, or one end of a capsule's axis [m]."""
+    to: tuple | None = vector(3, default=None)
+    """The other end of a capsule's axis [m]."""
+    radius: float | None = number(0.0, default=None)
+    """Of a sphere or a capsule [m]."""
+    semi_axes: tuple | None = vector(3, default=None)
+    """Of an ellipsoid [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clearance:
+    """Section [clearance]: how far shapes keep from each other, from the start to the end."""
+
+    distance: float = number(0.0)
+    """m."""
+    margin: float = number(0.0, default=0.005)
+    """Added at the grid's points, so that the distance holds between them too [m]."""
+    pairs: tuple = pairs_of_names()
+    """Shapes that keep apart; if left out, each of the robot from each of the target."""
+    contact: tuple = pairs_of_names()
+    """Those of them that may come as close as they are in the grasp: one is on the link of the hand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gripper:
+    """Section [gripper]: what it can bear; moments are about the grasped frame."""
+
+    force: float = number(1e-6)
+    """Largest force after the grasp [N]."""
+    torque: float = number(1e-6)
+    """Largest moment after the grasp [N m]."""
+    impulse: float = number(1e-9)
+    """Largest impulse at the grasp [N s]."""
+    angular_impulse: float = number(1e-9)
+    """Largest impulse of the moment at the grasp [N m s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseAttitude:
+    """Section [base_attitude]: how far and how fast the base may turn, from the start to the end."""
+
+    turn: float = number(1e-6, 3.0)
+    """From its attitude at the start [rad]."""
+    rate: float = number(1e-9)
+    """rad/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """Section [sight]: a camera that sees the frame to be grasped until it is grasped."""
+
+    link: str = text()
+    """Of the robot."""
+    position: tuple = vector(3)
+    """Link axes [m]."""
+    axis: tuple = vector(3)
+    """Where it looks, link axes; of any length."""
+    half_angle: float = number(1e-3, 3.0)
+    """Of the cone that it sees [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,7 +348,17 @@ PHASES = {
     "detumble": ("stabilise",),
 }
 SECTIONS = {
-    "grasp": {"robot": Chaser, "target": Passive, "limits": Limits, "tolerance": Tolerance, "weights": Weights},
+    "grasp": {
+        "robot": Chaser,
+        "target": Passive,
+        "limits": Limits,
+        "tolerance": Tolerance,
+        "weights": Weights,
+        "clearance": Clearance,
+        "gripper": Gripper,
+        "base_attitude": BaseAttitude,
+        "sight": Sight,
+    },
     "identify": {"robot": Chaser, "load": Held, "limits": Limits, "sensors": Sensors, "weights": Weights},
     "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
     "detumble": {
@@ -279,4 +371,5 @@ SECTIONS = {
         "weights": Effort,
     },
 }
-OPTIONAL = ("load",)
+OPTIONAL = ("load", "clearance", "gripper", "base_attitude", "sight")
+NAMED = {"grasp": {"shapes": Solid}}  # sections of sections, with names of their own

@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import sdyn
+from planners.sections import Solid
 
 GREY, ORANGE, WHEEL, STEEL, PANEL = (200, 203, 209), (230, 159, 0), (86, 180, 233), (120, 126, 136), (38, 70, 130)
+RED = (213, 94, 0)
 ARMS = ((0, 114, 178), (0, 158, 115), (204, 121, 167), (240, 228, 66), (213, 94, 0))  # Okabe and Ito's palette
 
 
@@ -19,9 +21,9 @@ class Shape:
     """A solid on a link."""
 
     kind: str
-    """box, cylinder (along its own z), ball, or axes."""
+    """box, cylinder (along its own z), ball, ellipsoid, or axes."""
     size: tuple[float, ...]
-    """Edges of a box; radius and height; radius; length of the axes [m]."""
+    """Edges of a box; radius and height; radius; semi-axes; length of the axes [m]."""
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """Centre, in link axes [m]."""
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
@@ -53,6 +55,21 @@ def robot_shapes(robot: sdyn.Robot, body: tuple[int, int, int] = GREY, panels: b
             Shape("axes", (3.0 * radius,), x.position, x.rotation) for x in robot.frames if x.link == link.name
         ]
     return shapes
+
+
+def keep_out(solid: Solid) -> list[Shape]:
+    """What shows a shape that keeps clear, in axes of its link."""
+    start = np.array(solid.position)
+    if solid.semi_axes:
+        return [Shape("ellipsoid", solid.semi_axes, start, color=RED, opacity=0.25)]
+    ball = lambda place: Shape("ball", (solid.radius,), place, color=RED, opacity=0.25)
+    if not solid.to:
+        return [ball(start)]
+    along = np.subtract(solid.to, start)
+    length = float(np.linalg.norm(along))
+    middle, turn = start + along / 2, _along(along / length)
+    tube = Shape("cylinder", (solid.radius, length), middle, turn, RED, 0.25)
+    return [tube, ball(start), ball(start + along)]
 
 
 def extent(shapes: list[Shape]) -> float:

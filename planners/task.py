@@ -14,21 +14,28 @@ from pathlib import Path
 import numpy as np
 
 import sdyn
+from planners import solids
 from planners.sections import (
+    NAMED,
     OPTIONAL,
     PHASES,
     SECTIONS,
     Actuators,
+    BaseAttitude,
     Capture,
     Chaser,
+    Clearance,
     Effort,
     Goal,
+    Gripper,
     Held,
     Limits,
     Passive,
     Phase,
     Rest,
     Sensors,
+    Sight,
+    Solid,
     TaskError,
     Tolerance,
     Weights,
@@ -62,6 +69,11 @@ class Task:
     capture: Capture | None = None
     base: Actuators | None = None
     end: Rest | None = None
+    shapes: dict[str, Solid] = field(default_factory=dict)
+    clearance: Clearance | None = None
+    gripper: Gripper | None = None
+    base_attitude: BaseAttitude | None = None
+    sight: Sight | None = None
     attitude: float | None = None
     """Largest turn of the base from its start [rad]."""
     source: str = ""
@@ -176,12 +188,16 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     extra, sought = {}, tree.pop("parameters", ["base"]) if kind == "identify" else []
     if kind == "identify":
         extra["attitude"] = _attitude(tree.pop("attitude", None))
-    _refuse_unknown(tree, {*SECTIONS[kind], "phases"}, "the task")
+    several = NAMED.get(kind, {})
+    _refuse_unknown(tree, {*SECTIONS[kind], *several, "phases"}, "the task")
     phases = tree.get("phases", {})
     _refuse_unknown(_table(phases, "[phases]"), PHASES[kind], "[phases]")
     given = {key: record for key, record in SECTIONS[kind].items() if key in tree or key not in OPTIONAL}
     sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in given.items()}
     sections["phases"] = {p: _section(phases.get(p, {}), Phase, f"[phases.{p}]") for p in PHASES[kind]}
+    for key, record in several.items():
+        given = _table(tree.get(key, {}), f"[{key}]")
+        sections[key] = {name: _section(x, record, f"[{key}.{name}]") for name, x in given.items()}
     chaser = _chaser(sections["robot"], folder)
     task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
     return _checked(_loaded(task, sought), folder)
@@ -311,9 +327,19 @@ def _checked(task, folder):
     if body.grounded or body.moving:
         raise TaskError(f"[target] model {task.target.model!r} must be one free rigid body; lock its joints.")
     body.frame(task.target.frame)
+    task = replace(task, body=body.prefixed("target_"))
     if task.kind == "grasp":
         body.configuration(quaternion=task.target.quaternion)  # refuses one that has not unit length
-    return replace(task, body=body.prefixed("target_"))
+        _check_mission(task)
+    return task
+
+
+def _check_mission(task):
+    solids.check(task)
+    if task.sight:
+        task.chaser.link(task.sight.link)
+        if not np.linalg.norm(task.sight.axis) > 1e-9:
+            raise TaskError("axis in [sight] has no length; give where the camera looks.")
 
 
 def _check_detumbling(task):

@@ -42,6 +42,8 @@ def plan():
         robot=SimpleNamespace(frame="hand"),
         target=SimpleNamespace(frame="grasp"),
         body=target,
+        shapes={},
+        clearance=None,
     )
     return SimpleNamespace(task=task, phases=tuple(phases), status="solved")
 
