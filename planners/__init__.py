@@ -17,6 +17,7 @@ from planners.monte_carlo import MonteCarlo, monte_carlo
 from planners.outline import Outline, PhaseOutline, outline
 from planners.plan import PhaseResult, Plan, PlanError
 from planners.sections import Goal
+from planners.sensitivity import Sensitivity, sensitivity
 from planners.structures import Candidate, Structure, StructureChoice, choose_structure, lockings
 from planners.study import StudyError, study
 from planners.table import PlanTable, table

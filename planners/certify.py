@@ -3,8 +3,8 @@
 What is independent: limits, grasp, tracking and momentum are read off the plan's arrays by `sdyn` functions that the
 solver does not call (momentum, body poses of each structure, forward dynamics); the splines are evaluated again by
 scipy; the motion is integrated again from the planned torques by articulated-body forward dynamics and an RK4 on
-quaternions. What is shared: the robot models, `sdyn` itself, and, for the stationarity only, the statement of the
-problem, which is differentiated here by central differences and weighed with the plan's multipliers.
+quaternions. What is shared: the robot models, `sdyn` itself, and, for the conditions of a minimum only, the statement
+of the problem, which `optimality` differentiates by differences and weighs with the plan's multipliers.
 """
 
 import functools
@@ -17,12 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
-from planners.problem import ONCE, summary
+from planners import optimality
+from planners.optimality import Price
+from planners.problem import ONCE
 
-LIMIT, MOMENTUM, STATIONARITY = 1e-6, 1e-10, 1e-3
+LIMIT, MOMENTUM, STATIONARITY = 1e-6, 1e-10, 1e-6
+FLAT = 1e-6  # negative curvature that differences of gradients cannot tell from none, scaled as the stationarity
 DRIFT = 1e-9  # of momentum within a phase, relative to its largest term
 INTEGRATION = 1e-6  # m, rad, m/s, rad/s: largest difference to the integrated motion
-DIFFERENCE = 1e-6  # step of central differences, scaled variables
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Certificate:
     rows: tuple[Row, ...]
     active: tuple[str, ...] = ()
     """Limits that the plan touches."""
+    prices: tuple[Price, ...] = ()
+    """What one unit more of a limit, or of a wanted value, would save of the cost; the most important ones."""
 
     @property
     def passed(self) -> bool:
@@ -73,6 +77,7 @@ class Certificate:
         width = max(len(row.name) for row in self.rows)
         say = lambda r: f"{'ok ' if r.ok else 'BAD'}  {r.name:{width}}  {r.value:9.2e} <= {r.bound:7.1e} {r.unit}"
         lines = [say(row).rstrip() for row in self.rows]
+        lines += [f"{p.name}: saves {p.amount:.3g} of the cost per {p.unit or 'unit'}" for p in self.prices]
         return "\n".join([*lines, self.sentence])
 
     def to_json(self) -> str:
@@ -80,6 +85,7 @@ class Certificate:
         value = lambda row: row.value if np.isfinite(row.value) else None
         rows = [asdict(row) | {"value": value(row), "ok": row.ok} for row in self.rows]
         said = {"passed": self.passed, "sentence": self.sentence, "rows": rows, "active": list(self.active)}
+        said["prices"] = [asdict(price) for price in self.prices]
         return json.dumps(said, indent=1)
 
     @classmethod
@@ -87,7 +93,8 @@ class Certificate:
         """Reads what `to_json` wrote."""
         said = json.loads(text)
         value = lambda row: np.nan if row["value"] is None else row["value"]
-        return cls(tuple(Row(r["name"], value(r), r["bound"], r["unit"]) for r in said["rows"]), tuple(said["active"]))
+        rows = tuple(Row(r["name"], value(r), r["bound"], r["unit"]) for r in said["rows"])
+        return cls(rows, tuple(said["active"]), tuple(Price(**p) for p in said.get("prices", ())))
 
 
 def certify(task, plan) -> Certificate:
@@ -99,8 +106,20 @@ def certify(task, plan) -> Certificate:
     """
     rows, active = _limits(task, plan)
     module = importlib.import_module(f"planners.certify_{task.kind}")
-    rows += _integration(plan) + module.rows(task, plan) + [stationarity(task, plan)]
-    return Certificate(tuple(rows), (*active, *(row.touched for row in rows if row.touched)))
+    best = _optimality(task, plan)
+    rows += _integration(plan) + module.rows(task, plan)
+    rows += [
+        Row("stationarity and complementarity", best.residual, STATIONARITY, ""),
+        Row("least curvature within the constraints, negated", -best.curvature, FLAT, ""),
+    ]
+    touched = (row.touched for row in rows if row.touched)
+    return Certificate(tuple(rows), (*active, *touched), best.prices)
+
+
+def _optimality(task, plan) -> optimality.Optimality:
+    problem = importlib.import_module(f"planners.{task.kind}").problem(task, plan.info["options"]["fine"])
+    multipliers = plan.multipliers["equal"], plan.multipliers["below"]
+    return optimality.measure(problem, problem.form.join(plan.variables), *multipliers)
 
 
 def _limits(task, plan):
@@ -276,22 +295,3 @@ def _see(chain, q, v, frame):
         return *pose, twist, parts.sum(0), sdyn.centre_of_mass(chain, q), jnp.abs(parts).sum(0)
 
     return jax.vmap(one)(q, v)
-
-
-def stationarity(task, plan) -> Row:
-    """Gradient of the Lagrangian by central differences, relative to 1 + that of the cost, bounds left out."""
-    problem = importlib.import_module(f"planners.{task.kind}").problem(task, plan.info["options"]["fine"])
-    form, (data, low, high) = problem.form, problem.numbers
-    y, u = plan.multipliers["equal"], plan.multipliers["below"]
-    z = form.join(plan.variables)
-
-    def lagrangian(z):
-        v = summary(form, z, data)
-        return np.array([v.cost, v.cost + y @ v.equal + u @ v.below]), v.below
-
-    steps = DIFFERENCE * np.eye(len(z))
-    slopes = np.array([lagrangian(z + s)[0] - lagrangian(z - s)[0] for s in steps]) / (2 * DIFFERENCE)
-    r, slack = slopes[:, 1], lagrangian(z)[1]
-    held = ((z <= low + 1e-6) & (r > 0)) | ((z >= high - 1e-6) & (r < 0))
-    worst = max(np.abs(np.where(held, 0.0, r)).max(), np.abs(u * slack).max(initial=0.0), -u.min(initial=0.0))
-    return Row("stationarity and complementarity", float(worst / (1 + np.abs(slopes[:, 0]).max())), STATIONARITY, "")

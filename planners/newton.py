@@ -32,11 +32,21 @@ class Basis:
     """The rows J [k, n] that hold, their span and their null space."""
 
     def __init__(self, J):
-        Q, R, self.order = qr(np.asarray(J).T, pivoting=True)
+        Q, R, order = qr(J.T, pivoting=True)
         pivots = np.abs(np.diag(R))
-        self.rank = int((pivots > DEPENDENT * pivots.max(initial=0.0)).sum())
-        self.R, self.count = R[: self.rank, : self.rank], len(J)
-        self.Y, self.Z = Q[:, : self.rank], Q[:, self.rank :]
+        rank = int((pivots > DEPENDENT * pivots.max(initial=0.0)).sum())
+        self.J, self.held, self.R = J, order[:rank], R[:rank, :rank]
+        self.Y, self.Z = Q[:, :rank], Q[:, rank:]
+
+    def within(self, c):
+        """The shortest d [n] with J d + c = 0."""
+        return self.Y @ solve_triangular(self.R, -c[self.held], trans=1)
+
+    def balance(self, slope):
+        """Multipliers [k] with J^T multipliers + slope = 0, as far as the rows' span goes."""
+        multipliers = np.zeros(len(self.J))
+        multipliers[self.held] = solve_triangular(self.R, -self.Y.T @ slope)
+        return multipliers
 
     def solve(self, H, g, c):
         """The step d [n] and the multipliers [k].
@@ -44,13 +54,9 @@ class Basis:
         Raises:
             LinAlgError: If the curvature on the null space, Z^T H Z, is not positive definite.
         """
-        held = self.order[: self.rank]
-        d = self.Y @ solve_triangular(self.R, -c[held], trans=1)
-        factors = cho_factor(self.Z.T @ H @ self.Z)
+        factors, d = cho_factor(self.Z.T @ H @ self.Z), self.within(c)
         d = d - self.Z @ cho_solve(factors, self.Z.T @ (g + H @ d))
-        multipliers = np.zeros(self.count)
-        multipliers[held] = solve_triangular(self.R, -self.Y.T @ (g + H @ d))
-        return d, multipliers
+        return d, self.balance(g + H @ d)
 
 
 def limits(near: Linear, z, y, u, low, high) -> Limits:

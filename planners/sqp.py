@@ -227,9 +227,9 @@ def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
     return state, step, Found(z, real(1), real(0))
 
 
-def near(problem: Problem, z) -> Linear:
-    """The problem near a point z [n] (scaled), by what `solve` compiles."""
-    return _arrive(problem.form, *_blank(problem, z), problem.numbers).near
+def near(problem: Problem, z, numbers=None) -> Linear:
+    """The problem near a point z [n] (scaled), by what `solve` compiles; with other numbers than its own if given."""
+    return _arrive(problem.form, *_blank(problem, z), numbers or problem.numbers).near
 
 
 def compile_all(problem: Problem) -> None:

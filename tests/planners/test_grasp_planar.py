@@ -73,6 +73,26 @@ def test_plans_between_those_of_a_table_are_near_what_is_interpolated(plan, tmp_
     assert 0 < max(amount for _, amount, _ in check.violations) < 1e-4  # m, rad; measured 4.2e-5
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("position = [1.7223", "position = [1.7233"), ("time = 0.02", "time = 0.0202")],
+    ids=["target", "weight"],
+)
+def test_the_plan_follows_its_task_as_its_derivative_says(plan, old, new):
+    assert old in TEXT
+    other = parse(TEXT.replace(old, new))
+    before = sqp._arrive._cache_size()
+    found = planners.sensitivity(plan.task, plan, other)
+    assert sqp._arrive._cache_size() == before  # nothing is compiled
+    problem = grasp.problem(other)
+    z = problem.form.join(plan.variables)
+    *_, states = sqp.solve(problem, z[None])
+    again = sqp.outcome(sqp.pick(states, 0))
+    assert again.status == "solved"
+    assert np.linalg.norm(again.z - z - found.z) < 0.02 * np.linalg.norm(found.z)
+    assert abs(again.cost - plan.info["cost"] - found.cost) < 0.02 * abs(found.cost)
+
+
 @pytest.mark.slow
 def test_a_wanted_error_decides_the_grid(plan):
     """The motion, integrated again by other code, is that close to the plan."""
