@@ -53,7 +53,8 @@ def sensitivity(task: Task, plan: Plan, other: Task) -> Sensitivity:
     """
     make, fine = importlib.import_module(f"planners.{task.kind}").problem, plan.info["options"]["fine"]
     problem, there = make(task, fine), make(other, fine)
-    return derivative(problem, there, problem.form.join(plan.variables), *plan.multipliers.values())
+    z, multipliers = problem.form.join(plan.variables), plan.multipliers
+    return derivative(problem, there, z, multipliers["equal"], multipliers["below"])
 
 
 def derivative(problem: Problem, other: Problem, z, y, u) -> Sensitivity:
