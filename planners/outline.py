@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 import sdyn
+from planners import solids
 from planners.task import Task
 
 
@@ -25,7 +26,7 @@ class PhaseOutline(NamedTuple):
     decided: str
     """What the solver decides."""
     holds: tuple[str, ...]
-    """Constraints besides the joints' limits."""
+    """Constraints of this phase, besides those of all."""
 
 
 class Outline(NamedTuple):
@@ -33,13 +34,13 @@ class Outline(NamedTuple):
 
     phases: tuple[PhaseOutline, ...]
     limits: tuple[str, ...]
-    """Of the joints, in all phases."""
+    """In all phases."""
     cost: tuple[str, ...]
     """Terms of the cost, those with weight."""
 
 
 def outline(task: Task) -> Outline:
-    """A task in words: its phases in their order, what limits the joints, and what it costs."""
+    """A task in words: its phases in their order, what holds in all of them, and what it costs."""
     return Outline(tuple(KINDS[task.kind](task, name) for name in task.phases), _limits(task), _cost(task))
 
 
@@ -47,11 +48,16 @@ def _limits(task) -> tuple[str, ...]:
     slides = any(joint.kind == "prismatic" for joint in task.joints)
     unit, moment = ("rad or m", "N m or N") if slides else ("rad", "N m")
     position, kept = task.position_limits, f", {100 * task.limits.margin:g} % kept free"
-    return (
+    joints = (
         f"position from {_range(position[:, 0])} to {_range(position[:, 1])} {unit}",
         f"rate at most {_range(task.rate_limits)} {'rad/s or m/s' if slides else 'rad/s'}",
         f"torque at most {_range(task.torque_limits)} {moment}{kept if task.limits.margin else ''}",
     )
+    turn, clear = task.base_attitude, task.clearance
+    base = (f"the base turns by at most {turn.turn:g} rad, at most {turn.rate:g} rad/s",) if turn else ()
+    pairs = len(solids.pairs(task)) if clear else 0
+    apart = (f"{pairs} pair{'s' * (pairs > 1)} of shapes keep {clear.distance:g} m clear",) if clear else ()
+    return (*joints, *base, *apart)
 
 
 def _cost(task) -> tuple[str, ...]:
@@ -109,6 +115,16 @@ def _of_grasp(task, name) -> PhaseOutline:
         ),
         "stabilise": ("all joints rest at the end",),
     }
+    if task.gripper and together:
+        most = task.gripper
+        holds[name] += (
+            f"the gripper bears {most.force:g} N and {most.torque:g} N m; at the grasp {most.impulse:g} N s and "
+            f"{most.angular_impulse:g} N m s",
+        )
+    if task.sight and not together:
+        holds[name] += (
+            f"a camera on {task.sight.link!r} has {grip!r} within {task.sight.half_angle:g} rad of its axis",
+        )
     return PhaseOutline(
         name,
         task.phases[name].duration,

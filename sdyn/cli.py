@@ -246,7 +246,7 @@ def _show_task(name, out) -> int:
         for title, text in (more | {"decided": stage.decided, "holds": "\n".join(stage.holds)}).items():
             if text:
                 table.add_row("", Text(title, "dim"), Text(text))
-    table.add_row(Text("always", "bold"), Text("joints", "dim"), Text("\n".join(said.limits)))
+    table.add_row(Text("always", "bold"), Text("holds", "dim"), Text("\n".join(said.limits)))
     table.add_row(Text("cost", "bold"), Text("sum of", "dim"), Text("\n".join(said.cost)))
     console.print(table)
     folder = out or Path("out") / task.name
