@@ -22,6 +22,8 @@ class Lattice:
 
     def __init__(self, points):
         self.points = np.asarray(points, float)
+        if self.points.ndim != 2 or not self.points.size or not np.isfinite(self.points).all():
+            raise ValueError(f"points have the shape {self.points.shape}; give finite numbers, [count, axes].")
         self.axes = [np.unique(x) for x in self.points.T]
         self.steps = np.stack([np.searchsorted(a, x) for a, x in zip(self.axes, self.points.T, strict=True)], axis=1)
         self.row = {tuple(map(int, step)): k for k, step in enumerate(self.steps)}

@@ -117,7 +117,7 @@ class PlanTable:
                 plan(tasks[k], guess=self.guess(chosen[k]).variables, explain=False, progress=False), NOWHERE
             )
 
-        found = study(self.folder / "check", _runs(chosen, tasks, range(len(tasks)), {}), work)
+        found = study(self.folder / f"check-{len(chosen)}", _runs(chosen, tasks, range(len(tasks)), {}), work)
         return [self._checked(*each) for each in zip(chosen, tasks, map(_entry, found.values()), strict=True)]
 
     def _checked(self, point, task, entry) -> Check:
@@ -127,6 +127,7 @@ class PlanTable:
         error = {name: float(np.abs(x - entry.variables[name]).max()) for name, x in variables.items()}
         cost = sum(w * self.entries[k].cost for k, w in self.lattice.weights(point).items())
         error |= {"cost": abs(cost - entry.cost)}
+        error = error if entry.status == "solved" else dict.fromkeys(error, np.nan)
         return Check(point, error, bound, problem.worst(at.equal, at.below, 3), entry)
 
 
@@ -150,6 +151,7 @@ def table(
 
     Raises:
         StudyError: If the folder holds another table, or is in use.
+        ValueError: If the points are none.
     """
     lattice = Lattice(points)
     tasks = [task_at(point) for point in lattice.points]
@@ -191,8 +193,9 @@ def _rank(found: Plan):
 
 def _runs(points, tasks, order, options) -> dict[str, dict]:
     """The runs of a study: a folder is refused if any number of any of its tasks has changed."""
-    task = lambda k: hashlib.sha256(repr(tasks[k]).encode()).hexdigest()
-    return {str(k): {"number": k, "point": points[k].tolist(), "task": task(k)} | options for k in order}
+    with np.printoptions(floatmode="unique", threshold=np.inf):
+        sums = [hashlib.sha256(repr(task).encode()).hexdigest() for task in tasks]
+    return {str(k): {"number": k, "point": points[k].tolist(), "task": sums[k]} | options for k in order}
 
 
 def _arrays(found: Plan, start: int) -> dict:

@@ -59,6 +59,9 @@ def test_where_points_are_missing_nothing_is_said():
     assert lattice.weights([0.5, -0.5, 3]) is None and lattice.weights([5.0, 0, 3]) is None
     assert lattice.weights([1.2, 2.0, 3]) is not None  # on an edge that is whole
     assert len(lattice.middles(range(len(some)))) == 2
+    for points in ([1.0, 2.0], [], [[np.nan]]):
+        with pytest.raises(ValueError, match=r"\[count, axes\]"):
+            Lattice(points)
     two = Lattice([[0.0], [1.0]])
     assert np.isinf(two.error(two.weights([0.5]), {0: np.zeros(2), 1: np.ones(2)})).all()
 

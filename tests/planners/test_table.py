@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ class Made:
     """As much of a task as these plans need."""
 
     point: tuple
-    weight: float = 1.0
+    weights: np.ndarray = field(default_factory=lambda: np.ones(2))
 
 
 def task_at(point):
@@ -82,8 +82,9 @@ def test_each_plan_starts_from_the_nearest_that_is_solved(calls, tmp_path):
     count = len(calls)
     again = planners.table(task_at, POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
     assert len(calls) == count and str(again.entries) == str(table.entries)
+    other = lambda point: replace(task_at(point), weights=np.array([1.0, 1.0 + 1e-15]))
     with pytest.raises(planners.StudyError, match="another"):
-        planners.table(lambda point: Made(tuple(point), 2.0), POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
+        planners.table(other, POINTS, tmp_path, neighbours=2, seeds=3, iterations=9)
 
 
 def test_between_solved_points_there_are_guesses(calls, tmp_path):
