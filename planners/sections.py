@@ -236,7 +236,8 @@ class Clearance:
     distance: float = number(0.0)
     """m."""
     margin: float = number(0.0, default=0.005)
-    """Added at the grid's points, so that the distance holds between them too [m]."""
+    """Added at the grid's points, so that the distance holds between them too: a body that moves by x from one point to
+    the next may come closer by x^2 / (8 d) between them [m]."""
     pairs: tuple = pairs_of_names()
     """Shapes that keep apart; if left out, each of the robot from each of the target."""
     contact: tuple = pairs_of_names()
