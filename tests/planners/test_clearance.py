@@ -43,7 +43,7 @@ def numerically(p, u, q, w):
 def test_segments_are_as_far_apart_as_a_minimisation_says(rng):
     x = capsules(rng, 99)
     found, wanted = solids.segments(*x), np.array([numerically(*row) for row in zip(*x, strict=True)])
-    assert np.abs(found**2 - wanted**2).max() < 1e-7  # what the minimisation leaves: measured
+    assert np.abs(found**2 - wanted**2).max() < 1e-12  # measured 7e-15
 
 
 def test_an_ellipsoid_is_as_far_away_as_a_minimisation_says(rng):
@@ -53,19 +53,24 @@ def test_an_ellipsoid_is_as_far_away_as_a_minimisation_says(rng):
             continue
         on = {"type": "eq", "fun": lambda y: np.square(y / a).sum() - 1}
         y = minimize(lambda y: np.square(y - x).sum(), a * x / np.linalg.norm(x), constraints=on, tol=1e-14).x  # noqa: B023
-        assert abs(solids.from_ellipsoid(x[None], a)[0] - np.linalg.norm(x - y)) < 1e-6  # measured
+        assert abs(solids.from_ellipsoid(x[None], a)[0] - np.linalg.norm(x - y)) < 1e-9  # measured 5e-12
 
 
 def test_coal_says_the_same(rng):
     coal = pytest.importorskip("coal")
     at = lambda p, u: coal.Transform3s(_along(u / np.linalg.norm(u)), p + u / 2)
+    rod = lambda radius, u: coal.Capsule(radius, np.linalg.norm(u))
+    ask = lambda *pair: coal.distance(*pair, coal.DistanceRequest(), coal.DistanceResult())
     p, u, q, w = np.array(capsules(rng, 99))[:, [k for k in range(99) if k % 7 and k % 11]]
-    found = solids.segments(p, u, q, w) - 0.03
-    for k, d in enumerate(found):
-        ends = [coal.Capsule(r, np.linalg.norm(x[k])) for r, x in ((0.01, u), (0.02, w))]
-        result = coal.DistanceResult()
-        theirs = coal.distance(ends[0], at(p[k], u[k]), ends[1], at(q[k], w[k]), coal.DistanceRequest(), result)
-        assert abs(theirs - d) < 1e-6
+    body = Solid(link="b", position=(0.0, 0.0, 0.0), semi_axes=(0.3, 0.5, 0.9))
+    for k, d in enumerate(solids.segments(p, u, q, w)):
+        theirs = ask(rod(0.01, u[k]), at(p[k], u[k]), rod(0.02, w[k]), at(q[k], w[k]))
+        assert abs(theirs - d + 0.03) < 1e-12  # measured 6e-16
+        mine = Solid(link="a", position=tuple(p[k]), to=tuple(p[k] + u[k]), radius=0.01)
+        (d,) = solids._distance(*((x, np.eye(3)[None], np.zeros((1, 3))) for x in (mine, body)))
+        if d > 0:
+            theirs = ask(rod(0.01, u[k]), at(p[k], u[k]), coal.Ellipsoid(0.3, 0.5, 0.9), coal.Transform3s())
+            assert abs(theirs - d) < 1e-5  # measured 1.5e-6; its iterations end at 1e-6
 
 
 def test_the_solvers_distance_is_above_the_exact_one_by_no_more_than_it_says(rng):
@@ -83,8 +88,7 @@ def test_its_derivative_is_right_also_where_segments_are_parallel(rng):
     along = lambda h: clearance.segments(*(a + h * b for a, b in zip(x, y, strict=True)))
     at = jax.jit(lambda h: jax.jvp(along, (h,), (1.0,)), **ONCE)
     (d, slope), numeric = at(0.0), (at(1e-6)[0] - at(-1e-6)[0]) / 2e-6
-    error = np.abs(slope - numeric)
-    assert error[d > 0.01].max() < 1e-6  # measured
+    assert d.min() > 0.01 and np.abs(slope - numeric).max() < 1e-7  # measured 7e-9
 
 
 def test_the_level_of_an_ellipsoid_is_a_bound_below_its_distance(rng):
@@ -198,8 +202,8 @@ def test_the_certificate_sees_what_is_too_close(made_up):
     (robot, target), *_ = follow(SimpleNamespace(phases=phases[:1]))
     still = lambda x, at: replace(x, R=np.zeros_like(x.R) + np.eye(3), p=np.zeros_like(x.p) + at)
     for gap, active in ((0.05, True), (0.09, True), (0.11, False)):
-        # the horn lies along x, 0.2 from the target's origin; the trunk is a ball about the origin of all links
-        pair = still(robot, 0.0), still(target, [-0.4, 0.0, gap + 0.3 + 0.02 - 0.30])
+        # the horn lies along x, 0.3 from the target's origin; the trunk is a ball about the origin of all links
+        pair = still(robot, 0.0), still(target, [-0.27, 0.0, gap + 0.3 + 0.02 - 0.30])
         rows = {row.name: row for row in certify_mission._clearance(TASK, [pair])}
         row = rows["lack of clearance of 'trunk' from 'horn'"]
         assert abs(row.value - (0.06 - gap)) < 1e-12 and row.ok == (gap > 0.06) and bool(row.touched) == active
@@ -219,14 +223,6 @@ def test_a_mission_is_planned_and_certified(plan):
     assert plan.status == "solved" and plan.certificate.passed, plan.verdict
     touched = "the clearance of 'palm' from 'horn'", "the limit of the angular velocity of the base"
     assert set(touched) <= set(plan.certificate.active)
-
-
-@pytest.mark.slow
-def test_who_does_not_ask_comes_too_close(plan):
-    free = planners.plan(planners.load("grasp_planar"), progress=False)
-    rows = {row.name: row for row in certify_mission.rows(TASK, free, np.zeros(6))}
-    assert rows["lack of clearance of 'palm' from 'horn'"].value > 0.02  # measured
-    assert free.info["cost"] < plan.info["cost"]
 
 
 @pytest.mark.slow
