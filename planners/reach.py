@@ -69,8 +69,9 @@ def duration(x, data: Data):
 
 
 def control_points(spline: Clamped, x, q0):
-    """Control points [count, n]: three at either end stand still."""
-    still = lambda q: jnp.broadcast_to(q, (3, len(q0)))
+    """Control points [count, n]: those at either end that are no variables stand still."""
+    count = (spline.count - len(x["reach"])) // 2
+    still = lambda q: jnp.broadcast_to(q, (count, len(q0)))
     return jnp.concatenate([still(q0), x["reach"], still(x["end"])])
 
 
@@ -117,14 +118,17 @@ def _shape(task, fine):
     return Clamped(phase.control_points), max(4, round(phase.intervals * fine))
 
 
-def problem(task: Task, fine: float = 1.0, numbers: Data | None = None) -> Problem:
-    """The problem of a task, its grid multiplied by `fine`; its numbers are made unless given."""
+def problem(task: Task, fine: float = 1.0, numbers: Data | None = None, *, still: int = 3) -> Problem:
+    """The problem of a task, its grid multiplied by `fine`; its numbers are made unless given.
+
+    So many control points are `still` at either end: 3, and accelerations start and end at zero; 2, and they may jump.
+    """
     numbers = data(task) if numbers is None else numbers
     (spline, intervals), n, frame = _shape(task, fine), len(numbers.q0), task.robot.frame
     low, high = task.phases["reach"].duration
     free = (Block("duration", (1,), 10.0),) if low < high else ()
     form = Form(
-        (*free, Block("reach", (spline.count - 6, n)), Block("end", (n,))),
+        (*free, Block("reach", (spline.count - 2 * still, n)), Block("end", (n,))),
         Reach(spline, intervals, task.goal.quaternion is not None),
     )
     equal = (Rows(f"place of {frame!r} at the end", 1.0, "m", (3,)),)
@@ -203,7 +207,7 @@ def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
 
 def guess(problem: Problem, q, duration) -> np.ndarray:
     """The straight motion to joints q in about that duration, longer where rates ask for it: variables [n], scaled."""
-    numbers, inner = problem.data, problem.form.values.spline.count - 6
+    numbers, (inner,) = problem.data, (b.shape[0] for b in problem.form.blocks if b.name == "reach")
     T = np.clip(max(duration, 2 * (np.abs(q - numbers.q0) / numbers.rate).max()), *numbers.duration)
     s = np.linspace(0, 1, inner + 2)[1:-1, None]
     return problem.form.join({"duration": [T], "reach": (1 - s) * numbers.q0 + s * q, "end": q})

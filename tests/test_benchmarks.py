@@ -120,16 +120,14 @@ def test_points_on_the_front_are_marked():
 
 
 def test_the_peers_of_the_reach_solve_one_problem():
-    """Of the kept run: one robot and one cost everywhere, feasible motions, one minimum of both peers; the README says
-    how soon each is within a tenth of it.
-    """
+    """Of the kept run: one robot and one cost everywhere, feasible motions, one minimum; the README says how soon."""
     result = json.loads((ROOT / "benchmarks" / "results" / "reach_peers.json").read_text())
     assert max(result["agreement"].values()) <= 1e-10  # measured 9e-13
     runs, text = result["contenders"], " ".join((ROOT / "README.md").read_text(encoding="utf8").split())
     ends = {name: run["iterates"][-1] for name, run in runs.items()}
     assert len(ends) == 4 and all(end["feasible"] for end in ends.values())
-    peers = [end["cost"] for name, end in ends.items() if not name.startswith("planners")]
-    assert len(peers) == 2 and max(peers) <= (1 + 1e-5) * min(peers)  # measured 2e-7
+    same = [end["cost"] for name, end in ends.items() if name != "planners, smooth"]
+    assert max(same) <= (1 + 2e-4) * min(same)  # measured 8e-5, between splines and torques that are held
     (line,) = re.findall(r"One reach of 13 degrees of freedom.*?reach_peers.py", text)
-    for name in ("planners, 15 points", "Crocoddyl, FDDP", "CasADi, IPOPT"):
-        assert f"{result['seconds_within'][name]['0.1']:.2g} s" in line
+    for name in ("planners", "Crocoddyl, FDDP", "CasADi, IPOPT"):
+        assert f"{result['seconds_within'][name]['0.001']:.2g} s" in line

@@ -32,6 +32,17 @@ def test_a_bad_reach_is_refused_in_a_sentence(old, new, words):
         parse(TEXT.replace(old, new, 1))
 
 
+@pytest.mark.parametrize("still", [2, 3])
+def test_it_rests_at_both_ends_and_accelerations_may_jump_there(still):
+    problem = reach.problem(parse(TEXT), still=still)
+    spline, rng = problem.form.values.spline, np.random.default_rng(0)
+    x = {block.name: rng.normal(size=block.shape) for block in problem.form.blocks}
+    rate, acceleration = (
+        spline.basis([0.0, 1.0], k) @ np.asarray(reach.control_points(spline, x, problem.data.q0)) for k in (1, 2)
+    )
+    assert abs(rate).max() < 1e-12 and (abs(acceleration).min() > 1e-2) == (still == 2)
+
+
 def numbers(duration, rate=(1.0, 0.4, 1.0), weights=(0.02, 1.0, 3.0)):
     """Data of joints that start at zero, as far as costs need them."""
     return reach.Data(None, 0, (), np.zeros(3), None, np.array(rate), None, 0.0, np.array(duration), np.array(weights))
