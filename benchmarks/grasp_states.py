@@ -37,6 +37,7 @@ TIMES = np.arange(5.0, 82.0)  # s, from the shortest approach to the longest wai
 POSTURES = 5  # from which inverse kinematics starts, each time
 NEAR = 0.05  # m, rad; as the base reacts to the arm, the hand may come somewhat further than from a fixed one
 REACHED = 1e-4  # m, rad
+LEFT, NEIGHBOURS = "not found", 4  # what failed without such a reason is tried again from so many others
 FINE, CELLS = 0.1, 8  # degrees/s between the plans of the fine table, and cells in whose middles it is checked
 
 
@@ -110,6 +111,36 @@ def least_rates(J, twist, limits) -> float:
 PAIRS = np.array([(i, j, sign) for i, j in itertools.combinations(range(7), 2) for sign in (-1, 1)]).T
 
 
+def again(states, entries, seen, folder) -> list:
+    """The entries, those that failed and could be followed tried again: from where they ended, then from the nearest
+    that are solved, now that all are known.
+    """
+    solved = [k for k, entry in enumerate(entries) if entry.status == "solved"]
+    failed = [k for k, pair in enumerate(zip(entries, seen, strict=True)) if k not in solved and said(*pair)[0] == LEFT]
+
+    def work(x, rng):
+        k = x["number"]
+        near = sorted(solved, key=lambda j: np.linalg.norm(states[j] - states[k]))[:NEIGHBOURS]
+        for j in (k, *near):
+            guess = entries[j].variables
+            found = planners.plan(task_at(states[k]), guess=guess, explain=False, progress=False)
+            if found.status == "solved":
+                break
+        out = {"status": found.status, "iterations": len(found.history) - 1, "cost": found.info["cost"], "start": j}
+        out |= {"certificate": found.certificate.to_json() if found.certificate else "", "verdict": found.verdict}
+        return {name: np.array(x) for name, x in out.items()} | found.variables
+
+    found, out = planners.study(folder, {str(k): {"number": k} for k in failed}, work), list(entries)
+    for k, x in zip(failed, found.values(), strict=True):
+        numbers = dict(start=int(x["start"]), iterations=int(x["iterations"]), cost=float(x["cost"]))
+        if str(x["status"]) == "solved":
+            variables = {name: x[name] for name in entries[k].variables}
+            certificate = planners.Certificate.from_json(str(x["certificate"]))
+            words = dict(status="solved", verdict=str(x["verdict"]))
+            out[k] = entries[k]._replace(variables=variables, certificate=certificate, **words, **numbers)
+    return out
+
+
 def longest(good) -> int:
     """Most seconds in a row."""
     return max((sum(1 for _ in run) for value, run in itertools.groupby(good) if value), default=0)
@@ -127,7 +158,7 @@ def said(entry, seen) -> tuple[str, str]:
     if longest(on & slow) < steady:
         pace = min(seen["rates"][k : k + steady].max() for k in range(len(TIMES) - steady + 1))
         return "too fast", f"To stay on the handle for {steady} s a joint must turn at {pace:.2f} times its rate limit."
-    return "not found", f"The handle can be followed for {longest(on & slow)} s. {entry.verdict}"
+    return LEFT, f"The handle can be followed for {longest(on & slow)} s. {entry.verdict}"
 
 
 # -- results -----------------------------------------------------------------------------------------------------------
@@ -136,7 +167,7 @@ def said(entry, seen) -> tuple[str, str]:
 def summed_up(states, entries, seen) -> dict:
     """Rates of success, what successes violate at most, and what failures say."""
     solved = np.array([entry.status == "solved" and entry.certificate.passed for entry in entries])
-    reached = np.array([said(*pair)[0] in ("not found",) for pair in zip(entries, seen, strict=True)])
+    reached = np.array([said(*pair)[0] == LEFT for pair in zip(entries, seen, strict=True)])
     speed = np.linalg.norm(states, axis=1)
     good = [entry for entry, ok in zip(entries, solved, strict=True) if ok]
     rows = {}
@@ -201,7 +232,7 @@ def draw(states, entries, kinds, path):
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(2, 5, figsize=(15, 6.8), layout="constrained")
-    marks = {"out of reach": ".", "briefly in reach": "+", "too fast": "x", "not found": "1"}
+    marks = {"out of reach": ".", "briefly in reach": "+", "too fast": "x", LEFT: "1"}
     good = [e for e in entries if e.status == "solved"]
     after = np.array([e.variables["durations"][:3].sum() if e.status == "solved" else np.nan for e in entries])
     for axis, z in zip(axes.flat, np.unique(states[:, 2]), strict=False):
@@ -241,10 +272,11 @@ def main(folder):
     for part, some in ((near, found), (~near, rest)):
         for k, entry in zip(np.flatnonzero(part), some.entries, strict=True):
             entries[k] = entry
+    entries = again(states, entries, seen, folder / "again")
     summary = summed_up(states, entries, seen)
     harness.save("grasp_states", dict(machine=harness.machine(), **summary, interpolation=interpolated(fine)))
     kinds = ["" if e.status == "solved" else said(e, x)[0] for e, x in zip(entries, seen, strict=True)]
-    draw(states, list(entries), kinds, harness.RESULTS / "grasp_states.png")
+    draw(states, entries, kinds, harness.RESULTS / "grasp_states.png")
     print(json.dumps({k: x for k, x in summary.items() if k not in ("failed", "by_speed")}, indent=1))
 
 
