@@ -84,7 +84,7 @@ def plan(
     """Plan a task, certify the result, and write it with figures and an animation.
 
     Args:
-        task: A shipped task (grasp, grasp_planar, identify, identify_load, reach, detumble), or a .toml file.
+        task: A shipped task (grasp, grasp_planar, grasp_clear, identify, identify_load, reach, detumble), or .toml.
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
         solver: sqp, or casadi for a second opinion: the task stated again in CasADi and solved by IPOPT.
         seeds: How many starting points to try; the worst are dropped early, the best certified result is kept.
