@@ -139,7 +139,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     low, high = task.phases["stabilise"].duration
     rates, efforts = _scales(task, numbers)
     blocks = (
-        Block("duration", (1,), 10.0),
+        Block("duration", (1,), 10.0, "s"),
         Block("end", (len(rates),), rates),
         Block("efforts", (len(rates), values.spline.count - 3), efforts),
     )

@@ -162,7 +162,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     """The problem of a task, its grid multiplied by `fine`."""
     spline, intervals = _shape(task, fine)
     n, (low, high) = len(task.joints), task.phases["excite"].duration
-    blocks = Block("duration", (1,), 10.0), Block("excite", (spline.count - 6, n))
+    blocks = Block("duration", (1,), 10.0, "s"), Block("excite", (spline.count - 6, n))
     below = limit_rows(task, spline.count, spline.count - 1, intervals + 1)
     turn = Rows("turn of the base, relative to its limit (1 - cos)", 1.0, "", (intervals + 1,))
     form = Form(blocks, Identify(spline, intervals))

@@ -126,7 +126,7 @@ def problem(task: Task, fine: float = 1.0, numbers: Data | None = None, *, still
     numbers = data(task) if numbers is None else numbers
     (spline, intervals), n, frame = _shape(task, fine), len(numbers.q0), task.robot.frame
     low, high = task.phases["reach"].duration
-    free = (Block("duration", (1,), 10.0),) if low < high else ()
+    free = (Block("duration", (1,), 10.0, "s"),) if low < high else ()
     form = Form(
         (*free, Block("reach", (spline.count - 2 * still, n)), Block("end", (n,))),
         Reach(spline, intervals, task.goal.quaternion is not None),
