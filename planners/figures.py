@@ -269,8 +269,11 @@ def gyro(plan, motions) -> Figure:
     return figure
 
 
+CRITERIA = ("log_det", "trace_of_inverse", "smallest_eigenvalue", "condition_number")
+
+
 def information(plan) -> Figure:
-    """How well the manoeuvre tells the parameters: standard deviations, and singular values of the information."""
+    """How well the manoeuvre tells the parameters: standard deviations, singular values, and the usual criteria."""
     found = plan.info["results"]
     figure = Figure(figsize=(10.0, max(4.2, 0.28 * len(found["singular_values"]))), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -290,6 +293,8 @@ def information(plan) -> Figure:
     right.set_xticks(range(1, len(values) + 1))
     right.set_title("Singular values of the scaled measurements", fontsize=9, loc="left")
     right.set_xlabel("direction", fontsize=8)
+    said = [f"{name.replace('_', ' ')}: {found[name]:.4g}" for name in CRITERIA if found.get(name) is not None]
+    right.text(0.99, 0.97, "\n".join(said), transform=right.transAxes, ha="right", va="top", fontsize=8)
     for panel in (left, right):
         panel.tick_params(labelsize=8)
         panel.spines[["top", "right"]].set_visible(False)

@@ -10,6 +10,7 @@ from nbclient import NotebookClient
 
 QUICKLY = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"}  # to compile
 NOTEBOOKS = sorted((pathlib.Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+SLOW = {"05_identification"}  # two minutes to compile
 
 
 def printed(notebook):
@@ -19,7 +20,11 @@ def printed(notebook):
     return re.sub(r"\d\.?\d*e-1\d", "tiny", text)
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def marked(path):
+    return pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW))
+
+
+@pytest.mark.parametrize("path", list(map(marked, NOTEBOOKS)))
 def test_notebook_runs_and_prints_what_it_shows(path):
     kept = nbformat.read(path, as_version=4)
     fresh = nbformat.read(path, as_version=4)

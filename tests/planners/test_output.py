@@ -147,6 +147,7 @@ def test_quaternions_and_rotations_are_inverse():
 
 def test_figures_of_an_identification(plan, tmp_path):
     results = {"sigma_percent": {"m": 0.2, "Ixx": 0.01}, "singular_values": [3.0, 1.0], "subspace": "all"}
+    results |= {"log_det": 2.25, "condition_number": None}
     other = {"kind": "identify", "body": None, "sensors": SimpleNamespace(gyro=1e-5)}
     task = SimpleNamespace(**{**vars(plan.task), **other})
     phase = SimpleNamespace(**{**vars(plan.phases[0]), "passive": None})
@@ -154,7 +155,8 @@ def test_figures_of_an_identification(plan, tmp_path):
     names = {path.stem for path in figures.draw(alone, tmp_path)}
     assert {"gyro", "information", "momentum"} <= names and "grasp" not in names
     del results["sigma_percent"]
-    assert figures.information(alone).axes[0].texts[0].get_text() == "all"
+    left, right = figures.information(alone).axes
+    assert left.texts[0].get_text() == "all" and right.texts[0].get_text() == "log det: 2.25"
 
 
 # -- animation ---------------------------------------------------------------------------------------------------------
