@@ -116,8 +116,14 @@ def certify(task, plan) -> Certificate:
     return Certificate(tuple(rows), (*active, *touched), best.prices)
 
 
+def statement(task, solver):
+    """The module that states a task for a solver."""
+    return importlib.import_module(f"planners.{'shooting' if solver == 'riccati' else task.kind}")
+
+
 def _optimality(task, plan) -> optimality.Optimality:
-    problem = importlib.import_module(f"planners.{task.kind}").problem(task, plan.info["options"]["fine"])
+    options = plan.info["options"]
+    problem = statement(task, options["solver"]).problem(task, options["fine"])
     multipliers = plan.multipliers["equal"], plan.multipliers["below"]
     return optimality.measure(problem, problem.form.join(plan.variables), *multipliers)
 

@@ -1,6 +1,5 @@
 """From a task to a certified plan."""
 
-import importlib
 import platform
 import time
 from collections import Counter
@@ -10,8 +9,8 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from planners import relax, sqp
-from planners.certify import certify
+from planners import relax, riccati, shooting, sqp
+from planners.certify import certify, statement
 from planners.plan import Plan
 from planners.problem import Outcome
 from planners.task import Task, TaskError
@@ -36,8 +35,9 @@ def plan(
 
     Args:
         task: From `planners.load`.
-        solver: "sqp"; or "casadi", the referee: the task stated again in CasADi and solved by IPOPT, for a second
-            opinion, one first guess after the other.
+        solver: "sqp"; "casadi", the referee: the task stated again in CasADi and solved by IPOPT, for a second
+            opinion; or "riccati", multiple shooting with forward dynamics, for reaches with many knots, and plans that
+            are made again (`riccati.py`). The latter two take one first guess after the other.
         seeds: First guesses. The default solver gives each some iterations and goes on with the best few (`sqp.py`);
             the best result that is certified is kept, and the plan's info says how all ended.
         accuracy: "fast" (half of the task's intervals), "balanced", "accurate" (twice) or "reference" (four times);
@@ -47,7 +47,7 @@ def plan(
         guess: The variables of a similar task's plan to start from, instead of first guesses.
         explain: Whether to look for what an infeasible task's constraints would have to give; it takes longer than a
             plan.
-        iterations: Of the default solver, at most.
+        iterations: At most; the referee has its own limit.
 
     Returns:
         The plan. Its status is "solved", "infeasible" or "not converged", its verdict says so in a sentence.
@@ -71,7 +71,7 @@ def _planned(task, solver, seeds, accuracy, guess, explain, iterations, progress
     """The plan on one grid."""
     from planners.progress import Live
 
-    fine, module = ACCURACIES[accuracy], importlib.import_module(f"planners.{task.kind}")
+    fine, module = ACCURACIES[accuracy], statement(task, solver)
     began = time.monotonic()
     with Live(task.name, seeds, show=progress, iterations=iterations, tolerance=sqp.FEASIBLE) as live:
         live.compiling("the task")
@@ -130,7 +130,23 @@ def _by_ipopt(task, problem, z, live, _) -> tuple[list[Outcome], list]:
     return sorted(ends, key=lambda end: (end.status != "solved", end.cost)), history
 
 
-SOLVERS = {"sqp": _by_sqp, "casadi": _by_ipopt}
+def _by_riccati(task, problem, guesses, live, iterations) -> tuple[list[Outcome], list]:
+    """The same by multiple shooting, one start after the other: states and controls, or variables."""
+    ends, histories = [], []
+    for guess in guesses:
+        live.compiling("the problem and the solver")
+        history = []
+        start = guess if isinstance(guess, tuple) else shooting.driven(problem, guess)
+        for state in riccati.iterations(problem, *start, iterations):
+            history.append((int(state.iteration), float(state.cost), float(state.violation)))
+            live.iteration(*history[-1], float(state.step))
+        ends.append(riccati.outcome(problem, state))
+        histories.append(history)
+    order = sorted(range(len(ends)), key=lambda k: (ends[k].status != "solved", ends[k].cost))
+    return [ends[k] for k in order], histories[order[0]]
+
+
+SOLVERS = {"sqp": _by_sqp, "casadi": _by_ipopt, "riccati": _by_riccati}
 
 
 def _best(results) -> Plan:

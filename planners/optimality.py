@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import cholesky, eigh, null_space, solve_triangular
 
 from planners import sqp
-from planners.problem import Problem, summary
+from planners.problem import Problem, summaries
 
 DIFFERENCE, BEND = 1e-6, 1e-4  # steps of differences of values and of gradients, scaled variables
 HELD = 1e-6  # distance to a bound, scaled
@@ -46,13 +46,13 @@ def measure(problem: Problem, z, y, u) -> Optimality:
     """What can be said of a point z [n] (scaled) with multipliers y [e] and u [i] of the rows."""
     form, (data, low, high) = problem.form, problem.numbers
 
-    def values(z):
-        v = summary(form, z, data)
-        return np.array([v.cost, v.cost + y @ v.equal + u @ v.below])
+    def values(zs):
+        v = summaries(form, zs, data)
+        return np.array([v.cost, v.cost + v.equal @ y + v.below @ u])
 
     steps = DIFFERENCE * np.eye(len(z))
-    slopes, r = np.array([values(z + s) - values(z - s) for s in steps]).T / (2 * DIFFERENCE)
-    below = summary(form, z, data).below
+    slopes, r = (values(z + steps) - values(z - steps)) / (2 * DIFFERENCE)
+    (below,) = summaries(form, z[None], data).below
     bounds = np.where(z <= low + HELD, np.maximum(r, 0.0), 0.0), np.where(z >= high - HELD, np.maximum(-r, 0.0), 0.0)
     left = r - bounds[0] + bounds[1]
     worst = max(np.abs(left).max(), np.abs(u * below).max(initial=0.0), -u.min(initial=0.0))

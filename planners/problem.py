@@ -130,10 +130,12 @@ class Form:
     Args:
         blocks: The variables.
         values: Hashable; values(x, data) -> Values, with x the variables by name, physical units.
+        together: Points that `summaries` computes at once: many are faster, where one is a long chain of small steps.
     """
 
     blocks: tuple[Block, ...]
     values: Callable
+    together: int = 1
 
     def join(self, x: dict) -> np.ndarray:
         """Variables by name (physical, broadcast to their blocks) to the vector z (scaled), on the host."""
@@ -180,10 +182,27 @@ def summary(form: Form, z, data) -> Summary:
     return Summary(*map(np.asarray, _summary(form, z, data)))
 
 
+def summaries(form: Form, z, data) -> Summary:
+    """The same at many points [k, n]."""
+    parts = np.split(np.asarray(z), range(form.together, len(z), form.together))
+    longer = (np.concatenate([part, np.repeat(part[-1:], form.together - len(part), axis=0)]) for part in parts)
+    found = [_summaries(form, part, data) for part in longer]
+    return Summary(*(np.concatenate(x)[: len(z)] for x in zip(*found, strict=True)))
+
+
 @functools.partial(jax.jit, static_argnums=0, **ONCE)
 def _summary(form, z, data):
     v = form.at(z, data)
     return v.cost, v.equal, v.below
+
+
+def _summaries(form, z, data):
+    if form.together == 1:
+        return [x[None] for x in summary(form, z[0], data)]
+    return _together(form, z, data)
+
+
+_together = jax.jit(jax.vmap(_summary.__wrapped__, (None, 0, None)), static_argnums=0, **ONCE)
 
 
 @dataclass(frozen=True, eq=False)

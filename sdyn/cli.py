@@ -86,7 +86,8 @@ def plan(
     Args:
         task: A shipped task (grasp, grasp_planar, grasp_clear, identify, identify_load, reach, detumble), or .toml.
         out: Folder for the results; out/TASK if left out. Earlier results in it are replaced.
-        solver: sqp, or casadi for a second opinion: the task stated again in CasADi and solved by IPOPT.
+        solver: sqp; casadi for a second opinion: the task stated again in CasADi and solved by IPOPT; or riccati:
+            multiple shooting with forward dynamics, for a reach.
         seeds: How many starting points to try; the worst are dropped early, the best certified result is kept.
         accuracy: How fine the solver's grid is: fast (half of the task's intervals), balanced, accurate (twice) or
             reference (four times); or a wanted error such as 1e-6, for the first of these that delivers it.
