@@ -106,8 +106,8 @@ def data(task: Task) -> Data:
         task.torque_limits,
         task.base_limits,
         task.limits.margin,
-        task.end.speed
-        * np.r_[np.full(6, 3**-0.5), np.ones(len(task.joints))],  # so that the base's speeds are within it
+        # so that the base's speeds are within it, and all that touch it, by more than rounding
+        (1 - 1e-6) * task.end.speed * np.r_[np.full(6, 3**-0.5), np.ones(len(task.joints))],
         w.time,
         np.repeat([w.base_torque, w.base_force, w.joint_torque], [3, 3, len(task.joints)]),
         np.r_[[w.end_base] * 6, [w.end_joints * (joint.name not in task.base.wheels) for joint in task.joints]],
