@@ -4,7 +4,8 @@ The target starts where `grasp.toml` says, in the same attitude and with the sam
 lattice of 1.25 degrees/s within the ball of 5 degrees/s, in body axes: 257 states, from rest to spins about the
 largest, the smallest and the intermediate axis. A success counts only with its certificate. A failure is compared with
 where the handle goes, by inverse kinematics from many postures once a second, the base as it waits: whether the hand
-can be on the handle, and whether the joints can then move as it does, for as long as tracking takes.
+can be on the handle, and whether the joints can then move as it does, for as long as tracking takes. Where no posture
+is near the handle at any time, only some states are planned all the same; the others count as failures.
 
 A second, fine table about the task's own spin says what interpolating between plans errs by.
 
@@ -31,13 +32,19 @@ import numpy as np
 import planners
 import sdyn
 from planners import floating, grasp, seeds
+from planners.lattice import Lattice
+from planners.table import NOWHERE, Entry
 
 STEP, MOST = 1.25, 5.0  # degrees/s
 TIMES = np.arange(5.0, 82.0)  # s, from the shortest approach to the longest wait, approach and tracking
 POSTURES = 5  # from which inverse kinematics starts, each time
 NEAR = 0.05  # m, rad; as the base reacts to the arm, the hand may come somewhat further than from a fixed one
 REACHED = 1e-4  # m, rad
-LEFT, NEIGHBOURS = "not found", 4  # what failed without such a reason is tried again from so many others
+LEFT, NEIGHBOURS = "not found", 2  # what failed without such a reason is tried again from so many others
+PARTS = 101, 110  # where the states that are near enough are split into tables, which were planned side by side
+TRIES = 60  # iterations of the solver, each time; those that succeed take about 25
+FAR = 64  # of the states without a posture near the handle at any time, those that are planned all the same
+UNTRIED = Entry("not tried", "No plan was tried.", NOWHERE, 0, np.nan, {}, None)
 FINE, CELLS = 0.1, 8  # degrees/s between the plans of the fine table, and cells in whose middles it is checked
 
 
@@ -123,7 +130,7 @@ def again(states, entries, seen, folder) -> list:
         near = sorted(solved, key=lambda j: np.linalg.norm(states[j] - states[k]))[:NEIGHBOURS]
         for j in (k, *near):
             guess = entries[j].variables
-            found = planners.plan(task_at(states[k]), guess=guess, explain=False, progress=False)
+            found = planners.plan(task_at(states[k]), guess=guess, explain=False, iterations=TRIES, progress=False)
             if found.status == "solved":
                 break
         out = {"status": found.status, "iterations": len(found.history) - 1, "cost": found.info["cost"], "start": j}
@@ -178,6 +185,7 @@ def summed_up(states, entries, seen) -> dict:
     failed = [k for k, ok in enumerate(solved) if not ok]
     words = {k: said(entries[k], seen[k]) for k in failed}
     return dict(
+        planned=sum(entry is not UNTRIED for entry in entries),
         all=rate(solved),
         followable=rate(solved[reached]) | dict(successes_elsewhere=int((solved & ~reached).sum())),
         by_speed={f"{v:g}": rate(solved[np.abs(speed - v) < 1e-9]) for v in np.unique(speed.round(9))},
@@ -264,15 +272,16 @@ def main(folder):
     seen = list(planners.study(folder / "followed", runs, lambda x, rng: followed(np.array(x["spin"]), rng)).values())
     near = np.array([x["miss"].min() < NEAR for x in seen])
     print(f"{len(states)} states, {near.sum()} of them near enough", flush=True)
+    ordered = lambda part: np.flatnonzero(part)[Lattice(states[part]).order]
+    some = np.split(ordered(near), PARTS)
+    parts = {f"near-{k}": part for k, part in enumerate(some)} | {"far": ordered(~near)[:FAR]}
+    planned = {}
+    for name, part in parts.items():
+        table = planners.table(task_at, states[part], folder / name, seeds=1 if name == "far" else 3)
+        planned |= dict(zip(part, table.entries, strict=True))
     around = own_spin() + FINE * np.array([(0, 0, 0), *(x for x in itertools.product((-1, 0, 1), repeat=3) if any(x))])
-    found = planners.table(task_at, states[near], folder / "near", seeds=3)
     fine = planners.table(task_at, around, folder / "fine")
-    rest = planners.table(task_at, states[~near], folder / "far", seeds=1)
-    entries = np.empty(len(states), object)
-    for part, some in ((near, found), (~near, rest)):
-        for k, entry in zip(np.flatnonzero(part), some.entries, strict=True):
-            entries[k] = entry
-    entries = again(states, entries, seen, folder / "again")
+    entries = again(states, [planned.get(k, UNTRIED) for k in range(len(states))], seen, folder / "again")
     summary = summed_up(states, entries, seen)
     harness.save("grasp_states", dict(machine=harness.machine(), **summary, interpolation=interpolated(fine)))
     kinds = ["" if e.status == "solved" else said(e, x)[0] for e, x in zip(entries, seen, strict=True)]

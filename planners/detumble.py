@@ -143,7 +143,9 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
         Block("end", (len(rates),), rates),
         Block("efforts", (len(rates), values.spline.count - 3), efforts),
     )
-    return Problem(Form(blocks, values), numbers, {"duration": low}, {"duration": high}, (), rows(task, values))
+    return Problem(
+        Form(blocks, values, quick=True), numbers, {"duration": low}, {"duration": high}, (), rows(task, values)
+    )
 
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:

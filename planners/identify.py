@@ -165,7 +165,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     blocks = Block("duration", (1,), 10.0, "s"), Block("excite", (spline.count - 6, n))
     below = limit_rows(task, spline.count, spline.count - 1, intervals + 1)
     turn = Rows("turn of the base, relative to its limit (1 - cos)", 1.0, "", (intervals + 1,))
-    form = Form(blocks, Identify(spline, intervals))
+    form = Form(blocks, Identify(spline, intervals), quick=True)
     return Problem(form, data(task), {"duration": low}, {"duration": high}, (), (*below, turn))
 
 

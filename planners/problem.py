@@ -131,11 +131,13 @@ class Form:
         blocks: The variables.
         values: Hashable; values(x, data) -> Values, with x the variables by name, physical units.
         together: Points that `summaries` computes at once: many are faster, where one is a long chain of small steps.
+        quick: Whether XLA spends little on it: where optimising takes longer than it saves in hundreds of iterations.
     """
 
     blocks: tuple[Block, ...]
     values: Callable
     together: int = 1
+    quick: bool = False
 
     def join(self, x: dict) -> np.ndarray:
         """Variables by name (physical, broadcast to their blocks) to the vector z (scaled), on the host."""

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from planners import newton, qp
-from planners.problem import Form, Linear, Outcome, Problem, summary
+from planners.problem import ONCE, Form, Linear, Outcome, Problem, summary
 
 FEASIBLE = 1e-9  # scaled violation
 STATIONARY = 1e-8  # scaled gradient of the Lagrangian, relative to 1 + |gradient of the cost|
@@ -212,7 +212,11 @@ def status(s: State):
 
 
 _direction = jax.jit(direction)
-_arrive = jax.jit(arrive, static_argnums=0)
+_optimised, _quick = (jax.jit(arrive, static_argnums=0, **options) for options in ({}, ONCE))
+
+
+def _arrive(form: Form, *rest) -> State:
+    return (_quick if form.quick else _optimised)(form, *rest)
 
 
 def _blank(problem: Problem, z) -> tuple[State, Step, Found]:

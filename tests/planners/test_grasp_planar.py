@@ -81,9 +81,9 @@ def test_plans_between_those_of_a_table_are_near_what_is_interpolated(plan, tmp_
 def test_the_plan_follows_its_task_as_its_derivative_says(plan, old, new):
     assert old in TEXT
     other = parse(TEXT.replace(old, new))
-    before = sqp._arrive._cache_size()
+    before = sqp._optimised._cache_size()
     found = planners.sensitivity(plan.task, plan, other)
-    assert sqp._arrive._cache_size() == before  # nothing is compiled
+    assert sqp._optimised._cache_size() == before  # nothing is compiled
     problem = grasp.problem(other)
     z = problem.form.join(plan.variables)
     *_, states = sqp.solve(problem, z[None])

@@ -63,9 +63,9 @@ def nearest_on(x, far):
 def test_the_derivative_is_that_of_solving_again(change):
     """x = r f / |f|, cost (|f| - r)^2 / 2: differences of solutions, and the closed form's slope by r."""
     p, end = problem(), solved(problem())
-    before = sqp._arrive._cache_size()
+    before = sqp._optimised._cache_size()
     found = derivative(p, problem(**change), end.z, end.y, end.u)
-    assert sqp._arrive._cache_size() == before  # nothing is compiled
+    assert sqp._optimised._cache_size() == before  # nothing is compiled
     t, mine = 1e-3, {"radius": 1.0, "far": (3.0, 4.0)}
     part = lambda s: {k: np.add(mine[k], s * t * np.subtract(x, mine[k])) for k, x in change.items()}
     ahead, back = (solved(problem(**part(s)), 2 * end.z) for s in (1, -1))
