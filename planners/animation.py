@@ -122,8 +122,8 @@ def _shapes(plan) -> dict:
     shapes = {}
     for phase in plan.phases:
         shapes = {**robot_shapes(phase.robot), **shapes}
-    if plan.task.body:
-        shapes |= robot_shapes(plan.task.body, ORANGE, panels=True)
+    for body in filter(None, (plan.task.body, plan.task.load_body)):
+        shapes |= robot_shapes(body, ORANGE, panels=True)
     for solid in plan.task.shapes.values():
         shapes[solid.link] = [*shapes[solid.link], *keep_out(solid)]
     return shapes

@@ -62,6 +62,8 @@ class Task:
     body: sdyn.Robot | None = None
     """The target's structure; its names carry the prefix "target_"."""
     load: Held | None = None
+    load_body: sdyn.Robot | None = None
+    """The load's structure; its names carry the prefix "load_"."""
     unknown: dict[str, str] = field(default_factory=dict)
     """What is to be identified, "base" or "load": the name of its link."""
     sensors: Sensors | None = None
@@ -283,9 +285,10 @@ def _loaded(task, sought):
         body = _model(task.load.model, task.folder)
         if body.grounded or len(body.links) != 1:
             raise TaskError(f"[load] model {task.load.model!r} must be one free link.")
-        bodies["load"] = f"load_{body.links[0].name}"
-        chaser = task.chaser.attach(body.prefixed("load_"), task.robot.frame, f"load_{task.load.frame}")
-        task = replace(task, chaser=chaser)
+        body = body.prefixed("load_")
+        bodies["load"] = body.links[0].name
+        chaser = task.chaser.attach(body, task.robot.frame, f"load_{task.load.frame}")
+        task = replace(task, chaser=chaser, load_body=body)
     if not isinstance(sought, list) or not sought or any(x not in ("base", "load") for x in sought):
         raise TaskError(f'parameters is {sought!r}; it must be ["base"], ["load"] or ["base", "load"].')
     if "load" in sought and not task.load:

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 from rich.console import Console
 
+import planners
 import sdyn
 from planners import animation, figures, motion, progress, shapes
 
@@ -42,6 +43,7 @@ def plan():
         robot=SimpleNamespace(frame="hand"),
         target=SimpleNamespace(frame="grasp"),
         body=target,
+        load_body=None,
         shapes={},
         clearance=None,
     )
@@ -215,6 +217,13 @@ def test_every_link_of_every_model_has_a_shape(name):
         for shape in solids:
             np.testing.assert_allclose(shape.rotation.T @ shape.rotation, np.eye(3), atol=1e-12)
             assert min(shape.size) > 0.0 and np.linalg.det(shape.rotation) > 0.0
+
+
+def test_a_load_in_the_hand_is_shown_as_a_target_is():
+    task = planners.load("identify_load")
+    shown = animation._shapes(SimpleNamespace(task=task, phases=[SimpleNamespace(robot=task.chaser)]))
+    assert {shape.color for shape in shown["load_target"]} >= {shapes.ORANGE, shapes.PANEL}
+    assert shown.keys() == {link.name for link in task.chaser.links}
 
 
 def test_the_box_of_a_box_is_that_box():
