@@ -2,8 +2,9 @@
 
 Both share one compilation, made before, and start every candidate from the same first guess. "four arms" has every
 hand with up to two joints locked, and most candidates cannot reach the goal, as is found out cheaply; "one arm" has up
-to three of its joints locked, and most can. What it would take without those that cannot is said too. Seconds are those
-of the processor.
+to three of its joints locked, and most can. "docked" has two arms with up to one joint locked, and the other hand free,
+or docked with its arm locked, or with its arm moving. What it would take without those that cannot is said too. Seconds
+are those of the processor.
 """
 
 import time
@@ -42,15 +43,19 @@ time = 0.02
 torque = 1.0
 smoothness = 5.0
 """
-SCENES = {"four arms": ((1, 2, 3, 4), [0.75, 0.6, 1.2], 2), "one arm": ((1,), [1.2, 0.2, 1.3], 3)}
+SCENES = {
+    "four arms": ((1, 2, 3, 4), [0.75, 0.6, 1.2], 2),
+    "one arm": ((1,), [1.2, 0.2, 1.3], 3),
+    "docked": ((1, 2), [1.2, 0.2, 1.3], 1, ("hand1", "hand2")),
+}
 
 
-def scene(arms, position, lock):
+def scene(arms, position, lock, docks=()):
     """A task and its candidates."""
     names = ", ".join(f'"arm{a}_{k}"' for a in arms for k in range(1, 8))
     bent = ", ".join(f"arm{a}_2 = 0.8, arm{a}_4 = -1.2" for a in arms)
     task = parse(TASK.format(moving=names, joints=bent, position=position), "reach")
-    return task, structures.lockings(task, lock)
+    return task, structures.lockings(task, lock, docks)
 
 
 COMPILED = []
@@ -60,9 +65,9 @@ jax.monitoring.register_event_duration_secs_listener(
 
 
 def measured(task, candidates) -> dict:
-    """Both ways; the first call compiles."""
+    """Both ways; the first call compiles, and optimises everything, so that whatever can be compiled is."""
     began = time.process_time()
-    structures.choose_structure(task, candidates)
+    structures.choose_structure(task, candidates, drop=False)
     first, before = time.process_time() - began, len(COMPILED)
     runs = {}
     for name, drop in (("dropping", True), ("all", False)):
@@ -88,8 +93,22 @@ def measured(task, candidates) -> dict:
         part_of_its_time_without_what_is_out_of_reach=round(short / (long - saved), 3),
         iterations=[sum(c.iterations for c in x.candidates) for x in (quick, whole)],
         largest_bound_above_cost=max(above),
+        **docking(whole),
         first_call_cpu_s=round(first, 1),
     )
+
+
+def docking(choice) -> dict:
+    """What the best candidate with and without a dock costs, and what the dock must hold; nothing without docks."""
+    best = {}
+    for c in filter(lambda c: c.cost, choice.candidates):  # the cheapest first
+        arm = "moves" if any(not c.structure.frame.endswith(name[3]) for name in c.structure.joints) else "is locked"
+        best.setdefault(f"docked, its arm {arm}" if c.structure.dock else "free", c)
+    of = lambda c: dict(
+        frame=c.structure.frame, locked=c.locked, cost=c.cost, time=c.time, torque=c.torque, smoothness=c.smoothness,
+        duration_s=c.duration, dock_moment_N_m=c.dock_moment, dock_force_N=c.dock_force,
+    )  # fmt: skip
+    return {"docking": {name: of(c) for name, c in best.items()}} if len(best) > 1 else {}
 
 
 if __name__ == "__main__":

@@ -14,8 +14,12 @@ def rows(task, plan) -> list[Row]:
         Row("start differs from the task's", float(np.abs(phase.q[0] - task.first).max()), 1e-12, "m, rad"),
         Row("speed at start and end", float(np.abs(phase.v[[0, -1]]).max()), LIMIT, "rad/s, m/s"),
         Row("distance from the goal", float(np.linalg.norm(seen.p[-1] - task.goal.position)), LIMIT, "m"),
-        Row("total momentum", float(np.abs(seen.momentum).max()), LIMIT, "N m s, N s"),
     ]
+    if task.robot.dock is None:
+        out.append(Row("total momentum", float(np.abs(seen.momentum).max()), LIMIT, "N m s, N s"))
+    else:
+        moved = max(np.abs(phase.q[:, :7] - task.first[:7]).max(), np.abs(phase.v[:, :6]).max())
+        out.append(Row(f"motion of the docked frame {task.robot.dock!r}", float(moved), 1e-12, "m, rad, m/s, rad/s"))
     if task.goal.quaternion:
         (R,) = rotations(np.array([task.goal.quaternion]))
         apart = np.linalg.norm(seen.R[-1] - R)  # of two rotations by a small angle, that times the root of 2

@@ -55,7 +55,7 @@ def plan(
     Raises:
         TaskError: If an argument is none of these, or float64 is off.
     """
-    names, wanted = _checked(solver, seeds, accuracy, guess)
+    names, wanted = _checked(task, solver, seeds, accuracy, guess)
     for name in names:
         found = _planned(task, solver, seeds, name, guess, explain, iterations, progress)
         error = found.certificate.worst("integrated again") if found.certificate else np.inf
@@ -174,10 +174,12 @@ def _explained(found: Plan, problem, end: Outcome, guess, live) -> Plan:
     return replace(found, verdict=f"{found.verdict} {relax.sentence(needed)}", info=info)
 
 
-def _checked(solver, seeds, accuracy, guess) -> tuple[tuple[str, ...], float]:
+def _checked(task, solver, seeds, accuracy, guess) -> tuple[tuple[str, ...], float]:
     """Names of the grids to try, and the error that ends it."""
     if solver not in SOLVERS:
         raise TaskError(f"there is no solver {solver!r}; this version has {', '.join(map(repr, SOLVERS))}.")
+    if task.robot.dock and solver != "sqp":
+        raise TaskError(f"{task.robot.dock!r} is docked, and the solver {solver!r} knows free robots only; use 'sqp'.")
     if not isinstance(seeds, int) or seeds < 1:
         raise TaskError(f"seeds is {seeds!r}; it must be a whole number from 1.")
     if guess is not None and seeds != 1:

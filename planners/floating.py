@@ -252,12 +252,13 @@ def drift(c: Coupling, rates):
     return -jnp.einsum("kij,kjl,kl->ki", c.compliance, c.angular, rates)
 
 
-def free_torques(chains, c: Coupling, joints, v, accelerations):
+def free_torques(chains, c: Coupling, joints, v, accelerations, floats=1.0):
     """Joint torques and accelerations of free-floating motion without external forces.
 
     Args:
         chains, c: The chain, or k stacked ones, and k couplings.
         joints, v, accelerations: Joint positions [k, n], velocities [k, nv], joint accelerations [k, n].
+        floats: 0 if the base is held at rest instead.
 
     Returns:
         (tau [k, n], vdot [k, nv]): torques [N m] and accelerations of the components of v.
@@ -265,8 +266,8 @@ def free_torques(chains, c: Coupling, joints, v, accelerations):
     wrench = _wrenches(chains, jnp.concatenate([joints, v, accelerations], axis=1))
 
     def one(c, wrench, qdd):
-        push = -wrench[3:6] / c.mass  # acceleration that the centre of mass lacks
-        turn = -c.compliance @ (wrench[:3] - cross(c.centre, wrench[3:6]))
+        push = -floats * wrench[3:6] / c.mass  # acceleration that the centre of mass lacks
+        turn = -floats * c.compliance @ (wrench[:3] - cross(c.centre, wrench[3:6]))
         tau = wrench[6:] + c.angular.T @ turn + c.linear.T @ push
         return tau, jnp.concatenate([turn, push + cross(c.centre, turn), qdd])
 
@@ -285,21 +286,27 @@ class Motion(NamedTuple):
     tau: jax.Array  # [k + 1, n]
 
 
-def at_zero_momentum(chain, path, times) -> Motion:
+def holding(chain, at: Motion):
+    """Moment and force [k, 6] that hold the base at rest, about its origin, base axes; N m, N."""
+    return _wrenches(chain, jnp.concatenate([at.q, at.v, at.vdot[:, 6:]], axis=1))[:, :6]
+
+
+def at_zero_momentum(chain, path, times, floats=1.0) -> Motion:
     """Motion without momentum of a robot whose base starts at the world's origin, in its axes.
 
     Args:
         chain: Packed structure.
         path: Joint positions, rates and accelerations at grid points and midpoints, [2 k + 1, n] each.
         times: Grid points [k + 1], from zero [s].
+        floats: 1; or 0, and the base is held where it starts. May be traced.
     """
     c, steps, still = couplings(chain, path[0]), jnp.diff(times), jnp.zeros((len(times) - 1, 3))
-    R = attitudes(jnp.eye(3), thirds(c.compliance), thirds(drift(c, path[1])), still, steps)
+    R = attitudes(jnp.eye(3), thirds(c.compliance), thirds(floats * drift(c, path[1])), still, steps)
     c, (q, rate, acceleration) = jax.tree.map(lambda a: a[::2], (c, path))
     momentum = Momentum(c.centre[0], jnp.zeros(3), jnp.zeros(3))
-    p = jax.vmap(base_position, (0, 0, 0, None))(c, R, times, momentum)
-    v = jnp.concatenate([jax.vmap(base_twist, (0, 0, 0, None))(c, R, rate, momentum), rate], axis=1)
-    tau, vdot = free_torques(chain, c, q, v, acceleration)
+    p = floats * jax.vmap(base_position, (0, 0, 0, None))(c, R, times, momentum)
+    v = jnp.concatenate([floats * jax.vmap(base_twist, (0, 0, 0, None))(c, R, rate, momentum), rate], axis=1)
+    tau, vdot = free_torques(chain, c, q, v, acceleration, floats)
     return Motion(times, R, p, q, v, vdot, tau)
 
 

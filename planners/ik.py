@@ -32,7 +32,7 @@ class Posture(NamedTuple):
 
 
 def inverse_kinematics(
-    chain: sdyn.Chain, frame, goal, q, *, limits=None, floats: bool = False, iterations: int = 60, tolerance=1e-10
+    chain: sdyn.Chain, frame, goal, q, *, limits=None, floats=False, iterations: int = 60, tolerance=1e-10
 ) -> Posture:
     """Joints that bring a frame to a goal, from one start; `vmap` it over starts, goals or structures.
 
@@ -43,7 +43,7 @@ def inverse_kinematics(
         q: The start [nq].
         limits: Lower and upper limits of the joints [joints, 2]; none if left out. The start is moved within them.
         floats: Whether a free base follows the joints at zero momentum, to first order in each step, with the centre of
-            mass where it is; it keeps its pose otherwise.
+            mass where it is; it keeps its pose otherwise. A number, 1 or 0, may be traced.
         iterations: At most.
         tolerance: Of the error's norm, at which the goal is reached.
 
@@ -55,10 +55,10 @@ def inverse_kinematics(
     nb = 0 if chain.capacity.layout == "grounded" else 7
     if chain.capacity.quaternions:
         raise ValueError("inverse_kinematics: spherical joints are not supported; use three revolute ones.")
-    if floats and not nb:
+    if floats is not False and not nb:
         raise ValueError("inverse_kinematics: a grounded base cannot float; leave floats out.")
     low, high = (-jnp.inf, jnp.inf) if limits is None else jnp.moveaxis(jnp.asarray(limits), -1, 0)
-    mass_centre = sdyn.centre_of_mass(chain, q) if floats else None
+    mass_centre = sdyn.centre_of_mass(chain, q) if floats is not False else None
 
     def body(carry):  # at first nothing is known and nothing moves, so that what a posture says is compiled once
         best, s, (e, J, follow) = carry
@@ -68,8 +68,9 @@ def inverse_kinematics(
         dq = dq * jnp.minimum(1.0, LONGEST / (jnp.abs(dq).max() + LEAST))
         joints = jnp.clip(s.q[nb:] + dq, low, high)
         base = s.q[:nb]
-        if floats:
-            base = _carried(chain, base, follow @ (joints - s.q[nb:]), joints, mass_centre)
+        if floats is not False:
+            carried = _carried(chain, base, follow @ (joints - s.q[nb:]), joints, mass_centre)
+            base = jnp.where(floats, carried, base)
         q = jnp.concatenate([base, joints])
         there = look(q)
         left = jnp.linalg.norm(there[0])
@@ -107,10 +108,10 @@ def _linear(chain, frame, goal, q, nb, floats):
     J = sdyn.frame_jacobian(chain, q, frame)
     closures = [sdyn.loop_jacobian(chain, q)] if chain.capacity.loops else []
     J = jnp.concatenate([J if goal[0] is not None else J[3:], *closures])
-    if not floats:
+    if floats is False:
         return e, J[:, first:], None
     M = sdyn.mass_matrix(chain, q)[:6]
-    follow = -jnp.linalg.solve(M[:, :6], M[:, 6:])
+    follow = -floats * jnp.linalg.solve(M[:, :6], M[:, 6:])
     return e, J[:, 6:] + J[:, :6] @ follow, follow
 
 

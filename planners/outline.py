@@ -142,7 +142,9 @@ def _of_reach(task, name) -> PhaseOutline:
     turn = "with its orientation" if task.goal.quaternion else "in any orientation"
     goal = f"{task.robot.frame!r} ends at ({place}) m, {turn}"
     holds = (goal, "all joints rest at both ends")
-    return PhaseOutline(name, task.phases[name].duration, task.chaser, None, "", FLOATS, _splines(task, name), holds)
+    dock, (low, high) = task.robot.dock, task.phases[name].duration
+    base = FLOATS if dock is None else f"is held: {dock!r} is docked where it is at the start"
+    return PhaseOutline(name, (low, high), task.chaser, None, "", base, _splines(task, name), holds)
 
 
 def _of_identify(task, name) -> PhaseOutline:

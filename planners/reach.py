@@ -1,8 +1,9 @@
-"""A free-floating robot brings a frame from rest to a pose at rest, as a problem.
+"""A free-floating or docked robot brings a frame from rest to a pose at rest, as a problem.
 
 Variables: the duration, unless the task fixes it; the joints' end, and the inner control points of a quintic spline of
-every joint, which starts and ends at rest by construction. Total momentum is zero: the base follows the joints. Limits
-of position, rate and torque; cost of time, torque and smoothness.
+every joint, which starts and ends at rest by construction. Total momentum is zero: the base follows the joints. Of a
+docked robot the base is the docked link, which rests: what holds it takes the momentum. A number says which, so that
+both share one compilation. Limits of position, rate and torque; cost of time, torque and smoothness.
 """
 
 import functools
@@ -26,6 +27,7 @@ from planners.task import Task
 
 POSTURES, SPREAD = 8, 0.6  # from which inverse kinematics starts, and how far they are from the start [rad]
 GOLDEN, SECTIONS = (5**0.5 - 1) / 2, 60
+FINE = 12  # intervals of the reported load of a dock for one of the solver's
 
 
 class Data(NamedTuple):
@@ -33,7 +35,7 @@ class Data(NamedTuple):
 
     chain: sdyn.Chain
     frame: jax.Array  # [] number of the frame in the chain
-    goal: tuple  # (rotation [3, 3], position [3]), world axes; any rotation will do where the form says so
+    goal: tuple  # (rotation [3, 3], position [3]), axes of the base at the start; any rotation where the form says so
     q0: jax.Array  # [n]
     position: jax.Array  # [n, 2] limits
     rate: jax.Array  # [n]
@@ -41,6 +43,7 @@ class Data(NamedTuple):
     margin: jax.Array  # [] part of the torque kept free
     duration: jax.Array  # [2] shortest and longest
     weights: jax.Array  # [3] time, torque, smoothness
+    floats: jax.Array  # [] 1, or 0 where the base is held
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,13 @@ def motion(spline: Clamped, intervals: int, x, data: Data) -> Motion:
     T, P = duration(x, data), control_points(spline, x, data.q0)
     s = np.linspace(0, 1, 2 * intervals + 1)
     path = tuple(spline.basis(s, order) @ P / T**order for order in range(3))
-    return floating.at_zero_momentum(data.chain, path, np.linspace(0, 1, intervals + 1) * T)
+    return floating.at_zero_momentum(data.chain, path, np.linspace(0, 1, intervals + 1) * T, data.floats)
 
 
 def miss(data: Data, at: Motion, oriented: bool):
-    """What the frame lacks to the goal at the end: place [3] in world axes; turn [3] in the goal's, to third order."""
+    """What the frame lacks to the goal at the end: place [3] in axes of the start; turn [3] in the goal's, to third
+    order.
+    """
     R, p = sdyn.frame_pose(data.chain, floating.at_rest(at.q[-1]), data.frame)
     R, p = at.R[-1] @ R, at.p[-1] + at.R[-1] @ p
     turn = [floating.logarithm(data.goal[0].T @ R)] if oriented else []
@@ -97,12 +102,12 @@ def data(task: Task, chain: sdyn.Chain | None = None) -> Data:
     Where there is room for more joints, those are bound to nothing: they cost what they move, and rest.
     """
     chain, w, goal = sdyn.pack(task.chaser) if chain is None else chain, task.weights, task.goal
-    n = chain.nv - 6
+    (R0, p0), n = _start(task), chain.nv - 6
     room = lambda x, fill: np.concatenate([x, np.full((n - len(x), *x.shape[1:]), fill)])
     return Data(
         chain,
         np.asarray(chain.capacity.frame_names.index(task.robot.frame)),
-        (rotations(np.array([goal.quaternion or (1.0, 0, 0, 0)]))[0], np.array(goal.position)),
+        (R0.T @ rotations(np.array([goal.quaternion or (1.0, 0, 0, 0)]))[0], R0.T @ (np.array(goal.position) - p0)),
         room(task.start, 0.0),
         room(np.clip(task.position_limits, -1e3, 1e3), [-1e3, 1e3]),
         room(task.rate_limits, 1.0),
@@ -110,7 +115,13 @@ def data(task: Task, chain: sdyn.Chain | None = None) -> Data:
         np.asarray(task.limits.margin),
         np.array(task.phases["reach"].duration),
         np.array([w.time, w.torque, w.smoothness]),
+        np.array(float(task.robot.dock is None)),
     )
+
+
+def _start(task):
+    """Attitude [3, 3] and position [3] of the base at the start, world axes."""
+    return rotations(task.first[None, 3:7])[0], task.first[:3]
 
 
 def _shape(task, fine):
@@ -167,8 +178,9 @@ def _postures(numbers: Data, oriented: bool, starts) -> Postures:
     centre = lambda q: sdyn.centre_of_mass(numbers.chain, floating.at_rest(q))
 
     def one(q):
-        start = floating.at_rest(q).at[:3].set(centre(numbers.q0) - centre(q))
-        found = inverse_kinematics(numbers.chain, numbers.frame, goal, start, limits=numbers.position, floats=True)
+        start = floating.at_rest(q).at[:3].set(numbers.floats * (centre(numbers.q0) - centre(q)))
+        options = dict(limits=numbers.position, floats=numbers.floats)
+        found = inverse_kinematics(numbers.chain, numbers.frame, goal, start, **options)
         return Postures(found.q[7:], found.error, *least(numbers, found.q[7:]))
 
     return jax.vmap(one)(starts)
@@ -215,23 +227,39 @@ def guess(problem: Problem, q, duration) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=(0, 1), **ONCE)
 def _detailed(spline, intervals, x, data):
-    return motion(spline, intervals, x, data)
+    at = motion(spline, intervals, x, data)
+    return at, jnp.where(data.floats, 0.0, floating.holding(data.chain, at))
 
 
 def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
     """The motion on a grid `fine` times finer than the solver's, from the variables by name."""
-    at = jax.tree.map(np.asarray, _detailed(*_shape(task, fine), x, data))
-    q = np.hstack([at.p, floating.path_quaternions(at.R), at.q])
-    tau = np.hstack([np.zeros((len(at.tau), 6)), at.tau])
-    return (PhaseResult("reach", task.chaser, at.times, q, at.v, tau),)
+    at, held = jax.tree.map(np.asarray, _detailed(*_shape(task, fine), x, data))
+    R0, p0 = _start(task)
+    q = np.hstack([p0 + at.p @ R0.T, floating.path_quaternions(R0 @ at.R), at.q])
+    return (PhaseResult("reach", task.chaser, at.times, q, at.v, np.hstack([held, at.tau])),)
+
+
+def dock_load(task: Task, data: Data, x: dict) -> tuple[float, float]:
+    """The largest moment about the docked frame [N m], and the largest force [N], that hold it; on a fine grid."""
+    _, held = _detailed(*_shape(task, FINE), x, data)
+    moment, force = np.split(np.asarray(held), 2, axis=1)
+    moment = moment - np.cross(task.chaser.frame(task.robot.dock).position, force)
+    return tuple(float(np.linalg.norm(load, axis=1).max()) for load in (moment, force))
 
 
 def results(task: Task, problem: Problem, x: dict) -> dict:
     """How long it takes, and where the joints end."""
     end = dict(zip((j.name for j in task.joints), map(float, x["end"]), strict=True))
-    return {"frame": task.robot.frame, "duration_s": float(duration(x, problem.data)), "end": end}
+    out = {"frame": task.robot.frame, "duration_s": float(duration(x, problem.data)), "end": end}
+    if task.robot.dock is None:
+        return out
+    moment, force = dock_load(task, problem.data, x)
+    return out | {"dock": {"frame": task.robot.dock, "moment_N_m": moment, "force_N": force}}
 
 
 def sentence(x: dict, info: dict) -> str:
     """The verdict on a solved plan."""
-    return f"The frame {info['frame']!r} is at its goal, at rest, after {info['duration_s']:.2f} s."
+    said = f"The frame {info['frame']!r} is at its goal, at rest, after {info['duration_s']:.2f} s."
+    if (dock := info.get("dock")) is None:
+        return said
+    return f"{said} {dock['frame']!r} is held by up to {dock['force_N']:.3g} N and {dock['moment_N_m']:.3g} N m."

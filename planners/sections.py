@@ -111,6 +111,8 @@ class Chaser:
     """Joint positions at the start [rad or m]; zero where not named."""
     moving: tuple = names()
     """Joints that move; all of them if left out. The others are locked where `joints` has them."""
+    dock: str | None = text(default=None)
+    """Frame that a station holds where it is at the start, for a reach; nothing if left out, and the base floats."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
-"""Which structure does a reach best: which frame to use, which joints to lock, and which of several goals to reach.
+"""Which structure does a reach best: which frame to use, which joints to lock, whether to dock another frame first, and
+which of several goals to reach.
 
 All candidates are packed to one capacity, so that one compilation serves them: their problems differ in numbers only.
+A docked candidate is rooted at the docked link, which is held; the joints between it and the frame move or are locked.
 Each starts from the straight motion to the cheapest posture that inverse kinematics finds, the most promising first. A
 candidate is dropped
 
@@ -33,7 +35,7 @@ import sdyn
 from planners import reach, sqp
 from planners.problem import Problem
 from planners.sections import Goal
-from planners.task import Task, TaskError, written
+from planners.task import Task, TaskError, docked, written
 
 ITERATIONS = 150
 REACHED = 1e-6  # m, rad: error of inverse kinematics below which a posture is at the goal
@@ -49,6 +51,8 @@ class Structure:
     joints: tuple[str, ...]
     goal: Goal | None = None
     """Another than the task's: one of several places where a target can be grasped."""
+    dock: str | None = None
+    """A frame that is fastened where the task starts, as to a station: reroot to its link, and ground it."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class Candidate:
 
     structure: Structure
     locked: tuple[str, ...]
-    """Those of the joints between base and frame that are."""
+    """Those of the joints between base, or dock, and frame that are."""
     status: str
     """best, solved, infeasible or not converged; dropped; unreachable."""
     why: str
@@ -74,6 +78,9 @@ class Candidate:
     iterations: int = 0
     seconds: float = 0.0
     """Of the processor, of the optimisation."""
+    dock_moment: float | None = None
+    """The largest one that holds a docked frame, about it [N m]; so is the force [N]."""
+    dock_force: float | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,8 @@ class StructureChoice:
 
     def __str__(self) -> str:
         heads = ("frame", "locked", "status"), ("cost", "more", "time", "torque", "smooth", "T, s")
+        if any(c.structure.dock for c in self.candidates):
+            heads = heads[0], (*heads[1], "dock, N m", "N")
         names = [(_where(c.structure), ", ".join(c.locked) or "none", c.status) for c in self.candidates]
         numbers = [() if c.cost is None else self._numbers(c) for c in self.candidates]
         aligned = zip(_columns([heads[0], *names]), _columns([heads[1], *numbers], str.rjust), strict=True)
@@ -99,7 +108,8 @@ class StructureChoice:
 
     def _numbers(self, c):
         terms = (f"{x:.4f}" for x in (c.time, c.torque, c.smoothness))
-        return f"{c.cost:.5f}", f"{100 * (c.cost / self.best.cost - 1):+.2f} %", *terms, f"{c.duration:.2f}"
+        held = () if c.dock_moment is None else (f"{c.dock_moment:.2f}", f"{c.dock_force:.2f}")
+        return f"{c.cost:.5f}", f"{100 * (c.cost / self.best.cost - 1):+.2f} %", *terms, f"{c.duration:.2f}", *held
 
     def to_json(self) -> str:
         """The candidates as JSON text."""
@@ -109,36 +119,41 @@ class StructureChoice:
 
 
 def _where(structure: Structure) -> str:
-    """The frame, and the place that it goes to, if it is not the task's."""
+    """The frame, the place that it goes to, if it is not the task's, and what is docked."""
     at = "" if structure.goal is None else f" to {', '.join(f'{x:g}' for x in structure.goal.position)}"
-    return structure.frame + at
+    return structure.frame + at + (f", {structure.dock} docked" if structure.dock else "")
 
 
 def _columns(rows, align=str.ljust) -> list[str]:
     """Rows of words as lines of aligned columns; an empty row is an empty line."""
-    widths = [max(map(len, column)) for column in zip(*filter(None, rows), strict=True)]
+    widths = [max(map(len, column)) for column in itertools.zip_longest(*rows, fillvalue="")]
     return ["  ".join(align(x, w) for x, w in zip(row, widths, strict=False)) for row in rows]
 
 
-def lockings(task: Task, lock: int = 1) -> tuple[Structure, ...]:
+def lockings(task: Task, lock: int = 1, docks: tuple[str, ...] = ()) -> tuple[Structure, ...]:
     """Every frame of a task's robot, with up to `lock` of the joints between it and the base locked in every way.
 
     Args:
         task: A reach; its moving joints are the ones to choose from.
         lock: Joints, at most; one always moves.
+        docks: Frames, each to be docked in turn besides: with all joints between it and the base locked, and with none.
     """
     out = []
-    for frame in task.chaser.frames:
-        path = _between(task.chaser, frame)
+    for frame, dock in itertools.product(task.chaser.frames, (None, *docks)):
+        own, whole = _between(task.chaser, frame.name), _between(task.chaser, frame.name, dock)
+        arm = tuple(name for name in whole if name not in own)
+        path = tuple(name for name in own if name in whole)
         for count in range(min(lock, len(path) - 1) + 1):
             for still in itertools.combinations(path, count):
-                out.append(Structure(frame.name, tuple(name for name in path if name not in still)))
+                moving = tuple(name for name in path if name not in still)
+                out += [Structure(frame.name, moving + more, dock=dock) for more in dict.fromkeys(((), arm))]
     return tuple(out)
 
 
-def _between(robot, frame) -> tuple[str, ...]:
-    """The moving joints between the base and a frame."""
-    tree, link, out = robot.tree, [link.name for link in robot.links].index(frame.link), []
+def _between(robot, frame: str, dock: str | None = None) -> tuple[str, ...]:
+    """The moving joints between the base, or a docked frame, and a frame."""
+    robot = robot.reroot(robot.frame(dock).link) if dock else robot
+    tree, link, out = robot.tree, [link.name for link in robot.links].index(robot.frame(frame).link), []
     while tree.parent[link] >= 0:
         out.append(robot.joints[tree.joint[link]])
         link = tree.parent[link]
@@ -173,10 +188,10 @@ def choose_structure(task: Task, candidates=None, *, drop: bool = True) -> Struc
     # matrices of a few hundred rows: two threads of BLAS take twice the time of one
     with threadpool_limits(1, "blas"):
         for k in np.argsort(bounds, kind="stable"):
-            path = _between(task.chaser, task.chaser.frame(candidates[k].frame))
+            path = _between(task.chaser, candidates[k].frame, candidates[k].dock)
             locked = tuple(name for name in path if name not in candidates[k].joints)
             row = Candidate(candidates[k], locked, "dropped", "", float(bounds[k]))
-            rows.append(_decided(row, problems[k], found[k], cut, drop))
+            rows.append(_decided(row, tasks[k], problems[k], found[k], cut, drop))
             if rows[-1].status == "solved" and rows[-1].cost < cut:
                 best, cut = k, rows[-1].cost
     if best is not None:
@@ -191,6 +206,8 @@ def _check(task, candidates):
         raise TaskError(f"the task {task.name!r} is of kind {task.kind!r}; structures are chosen for a reach.")
     if not jax.config.jax_enable_x64:
         raise TaskError('planning needs float64; call jax.config.update("jax_enable_x64", True) first.')
+    if task.robot.dock:
+        raise TaskError(f"the task docks {task.robot.dock!r}; leave dock out of [robot], and give it to candidates.")
     moving = [j.name for j in task.joints]
     if not candidates or not all(structure.joints for structure in candidates):
         raise TaskError("a candidate is missing or moves nothing; give Structure(frame, joints) with joints that move.")
@@ -206,14 +223,15 @@ def _check(task, candidates):
 
 
 def variant(task: Task, structure: Structure) -> Task:
-    """The task with the structure's frame and goal, and its joints alone."""
+    """The task with the structure's frame, goal and dock, and its joints alone."""
     start = dict(zip([j.name for j in task.joints], task.start, strict=True))
     chaser = task.chaser.lock({name: q for name, q in start.items() if name not in structure.joints})
     tree = tomllib.loads(task.source)
-    tree["robot"] |= {"frame": structure.frame, "moving": list(structure.joints)}
-    section, goal = replace(task.robot, frame=structure.frame, moving=structure.joints), structure.goal or task.goal
+    words = {"frame": structure.frame, "moving": structure.joints, "dock": structure.dock}
+    tree["robot"] |= {key: x for key, x in words.items() if x is not None}
+    section, goal = replace(task.robot, **words), structure.goal or task.goal
     tree["goal"] = {key: x for key, x in asdict(goal).items() if x is not None}
-    return replace(task, chaser=chaser, robot=section, goal=goal, source=written(tree))
+    return docked(replace(task, chaser=chaser, robot=section, goal=goal, source=written(tree)))
 
 
 def _bounds(candidates, found) -> np.ndarray:
@@ -221,12 +239,13 @@ def _bounds(candidates, found) -> np.ndarray:
     own = [x.cost[x.best] if x.error[x.best] <= REACHED else np.inf for x in found]
     return np.array([
         min(x for other, x in zip(candidates, own, strict=True)
-            if (other.frame, other.goal) == (one.frame, one.goal) and set(other.joints) <= set(one.joints))
+            if (other.frame, other.goal, other.dock) == (one.frame, one.goal, one.dock)
+            and set(other.joints) <= set(one.joints))
         for one in candidates
     ])  # fmt: skip
 
 
-def _decided(row: Candidate, problem: Problem, found: reach.Postures, cut: float, drop: bool) -> Candidate:
+def _decided(row: Candidate, task, problem: Problem, found: reach.Postures, cut: float, drop: bool) -> Candidate:
     """What becomes of a candidate, given the best cost so far."""
     above = cut * (1 + ABOVE)
     if drop and not np.isfinite(row.bound):
@@ -242,7 +261,7 @@ def _decided(row: Candidate, problem: Problem, found: reach.Postures, cut: float
         if drop and np.isfinite(cut) and (why := _hopeless(s, low, high, above)):
             break
     row = replace(row, iterations=int(s.iteration), seconds=time.process_time() - began)
-    return replace(row, why=why) if why else replace(row, **_ended(problem, sqp.outcome(s)))
+    return replace(row, why=why) if why else replace(row, **_ended(task, problem, sqp.outcome(s)))
 
 
 def _hopeless(s: sqp.State, low, high, above: float) -> str:
@@ -265,7 +284,7 @@ def dual_bound(s: sqp.State, low, high) -> float:
     return float(near.cost + s.y @ near.equal + s.u @ near.below - ((vectors.T @ r[free]) ** 2 / values).sum() / 2)
 
 
-def _ended(problem: Problem, end) -> dict:
+def _ended(task, problem: Problem, end) -> dict:
     """How an optimisation ended: status, why, and the terms of the cost."""
     if end.status != "solved":
         off = problem.worst(end.equal, end.below, 1)
@@ -277,4 +296,6 @@ def _ended(problem: Problem, end) -> dict:
     terms = {"time": float(numbers.weights[0] * T)}
     terms["smoothness"] = float(numbers.weights[2] * np.trapezoid(squares, s * T))
     terms["torque"] = end.cost - sum(terms.values())
+    if task.robot.dock:
+        terms["dock_moment"], terms["dock_force"] = reach.dock_load(task, numbers, x)
     return {"status": "solved", "cost": end.cost, "duration": T, **terms}

@@ -15,6 +15,7 @@ import numpy as np
 
 import sdyn
 from planners import solids
+from planners.motion import quaternions
 from planners.sections import (
     NAMED,
     OPTIONAL,
@@ -78,9 +79,11 @@ class Task:
     sight: Sight | None = None
     attitude: float | None = None
     """Largest turn of the base from its start [rad]."""
+    place: tuple = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    """Of the base at the start, position [m] and quaternion; of a docked robot, whose base is the docked link."""
     source: str = ""
     """The text that was read."""
-    folder: Path = FOLDER
+    folder: Path = field(default=FOLDER, repr=False)
     """Where robot files are looked for."""
 
     @property
@@ -140,9 +143,9 @@ class Task:
 
     @property
     def first(self) -> np.ndarray:
-        """Configuration at time zero, [nq]: the base at the world's origin."""
-        moving = {joint.name for joint in self.joints}
-        return self.chaser.configuration({k: x for k, x in self.robot.joints.items() if k in moving})
+        """Configuration at time zero, [nq]: the model's base at the world's origin."""
+        position, quaternion = self.place
+        return self.chaser.configuration(_posture(self.chaser, self.robot), position=position, quaternion=quaternion)
 
 
 def load(path_or_name) -> Task:
@@ -202,7 +205,28 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
         sections[key] = {name: _section(x, record, f"[{key}.{name}]") for name, x in given.items()}
     chaser = _chaser(sections["robot"], folder)
     task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
-    return _checked(_loaded(task, sought), folder)
+    return docked(_checked(_loaded(task, sought), folder))
+
+
+def docked(task: Task) -> Task:
+    """The task with the link of the robot's dock as base, and its place at the start; as it is without a dock."""
+    if task.robot.dock is None:
+        return task
+    if task.kind != "reach":
+        raise TaskError(f"dock in [robot]: robots dock for a reach, not for the kind {task.kind!r}; leave it out.")
+    chaser, link = task.chaser, task.chaser.frame(task.robot.dock).link
+    if chaser.frame(task.robot.frame).link == link:
+        raise TaskError(f"dock in [robot]: {task.robot.dock!r} is on the link that is to reach the goal; dock another.")
+    first = chaser.configuration(_posture(chaser, task.robot))
+    at = chaser.close(sdyn.Frame("dock", link), "ground", q=first).loops[-1].frame_b  # where the link is in the world
+    place = tuple(at.position.tolist()), tuple(quaternions(at.rotation).tolist())
+    return replace(task, chaser=chaser.reroot(link), place=place)
+
+
+def _posture(chaser, section) -> dict:
+    """Values of the joints that move, by name, as the section [robot] has them."""
+    moving = {joint.name for joint in chaser.moving}
+    return {name: x for name, x in section.joints.items() if name in moving}
 
 
 def written(tree: dict, name: str = "") -> str:

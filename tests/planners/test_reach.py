@@ -45,7 +45,9 @@ def test_it_rests_at_both_ends_and_accelerations_may_jump_there(still):
 
 def numbers(duration, rate=(1.0, 0.4, 1.0), weights=(0.02, 1.0, 3.0)):
     """Data of joints that start at zero, as far as costs need them."""
-    return reach.Data(None, 0, (), np.zeros(3), None, np.array(rate), None, 0.0, np.array(duration), np.array(weights))
+    return reach.Data(
+        None, 0, (), np.zeros(3), None, np.array(rate), None, 0.0, np.array(duration), np.array(weights), 1.0
+    )
 
 
 @pytest.mark.parametrize("slower", [1.2, 2.0])  # than all the way at the largest rate

@@ -5,13 +5,14 @@ import tomllib
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from structures import QUICKLY
 
 import planners
 import sdyn
-from planners import reach, sqp
+from planners import floating, reach, sqp
 from planners.problem import Linear
 from planners.structures import REACHED, _bounds, dual_bound, variant
 from planners.task import parse, written
@@ -35,6 +36,25 @@ smoothness = 20.0
 """
 TASK = parse(TEXT, "planar")
 HAND = planners.Structure("hand", ("joint1",))
+DOCKED = planners.Structure("hand", ("joint1", "joint3", "leg1", "leg2"), dock="foot")
+LEGS = "joint1 = -0.9, joint2 = 1.5, joint3 = 0.5, leg1 = 0.6, leg2 = -0.8"
+
+
+@pytest.fixture(scope="module")
+def two_arms(tmp_path_factory):
+    """The planar robot with a second arm, whose foot can be docked."""
+    folder, one = tmp_path_factory.mktemp("robot"), sdyn.models.load("planar3")
+    legs = [sdyn.Link(f"shank{k}", 2.0, [0.2, 0, 0], np.diag([0.01, 0.03, 0.03])) for k in (1, 2)]
+    each = dict(limits=(-2, 2), rate=0.5, effort=1)
+    joints = [
+        sdyn.Joint("leg1", "revolute", "base", "shank1", np.diag([-1.0, -1, 1]), [-0.37, 0, 0], **each),
+        sdyn.Joint("leg2", "revolute", "shank1", "shank2", position=[0.4, 0, 0], **each),
+    ]
+    foot = sdyn.Frame("foot", "shank2", position=[0.4, 0, 0])
+    robot = replace(one, links=(*one.links, *legs), joints=(*one.joints, *joints), frames=(*one.frames, foot))
+    sdyn.save(robot, folder / "two.json")
+    text = TEXT.replace("planar3", "two.json").replace("joint1 = -0.9, joint2 = 1.5, joint3 = 0.5", LEGS)
+    return parse(text, "two", folder)
 
 
 def large(*arms):
@@ -58,6 +78,48 @@ def test_every_way_to_lock_some_joints():
     found = planners.lockings(large(1, 2))
     assert [x.frame for x in found] == ["hand1"] * 8 + ["hand2"] * 8
     assert all(name.startswith("arm" + x.frame[-1]) for x in found for name in x.joints)
+
+
+def test_a_dock_is_held_by_an_arm_that_moves_or_is_locked(two_arms):
+    found = [x for x in planners.lockings(two_arms, 1, ("foot",)) if x.frame == "hand"]
+    joints = ("joint1", "joint2", "joint3")
+    assert [x.joints for x in found if x.dock is None] == [joints, joints[1:], joints[::2], joints[:2]]
+    assert {x.joints for x in found if x.dock and len(x.joints) > 3} == {
+        (*x.joints, "leg2", "leg1") for x in found if x.dock is None
+    }
+    assert len(found) == len(set(found)) == 12
+    feet = [x for x in planners.lockings(two_arms, 0, ("foot",)) if x.frame == "foot"]
+    assert [(x.joints, x.dock) for x in feet] == [(("leg1", "leg2"), None)], "a frame is not docked and moved at once"
+
+
+def test_a_docked_variant_is_the_task_that_its_text_says(two_arms):
+    """Its base is the docked link, held where it is while the robot's base is at the origin."""
+    task = variant(two_arms, DOCKED)
+    again = parse(task.source, "two", two_arms.folder)
+    assert again.robot == task.robot and repr(again.chaser) == repr(task.chaser) and again.place == task.place
+    assert task.chaser.base == "shank2" and [j.name for j in task.joints] == list(DOCKED.joints)
+    knee, foot = np.pi + 0.6, np.pi + 0.6 - 0.8
+    assert np.abs(np.subtract(task.place[0], [-0.37 + 0.4 * np.cos(knee), 0.4 * np.sin(knee), 0.0])).max() < 1e-15
+    assert np.abs(np.subtract(task.place[1], [np.cos(foot / 2), 0.0, 0.0, np.sin(foot / 2)])).max() < 1e-15
+
+
+def test_a_docked_robot_needs_the_torques_of_the_grounded_one(two_arms, rng):
+    """And what holds it is the rate of its momentum."""
+    robot = variant(two_arms, DOCKED).chaser
+    free, grounded = sdyn.pack(robot), sdyn.pack(robot.ground(robot.base))
+    path = tuple(rng.normal(size=(3, 5, len(DOCKED.joints))))
+    at = jax.jit(lambda floats: floating.at_zero_momentum(free, path, np.arange(3.0), floats), **QUICKLY)(0.0)
+    assert max(np.abs(x).max() for x in (at.R - np.eye(3), at.p, at.v[:, :6], at.vdot[:, :6])) == 0
+
+    def known(q, v, vdot):
+        q7, state = floating.at_rest(q), lambda q, v: (sdyn.momentum(free, q, v), sdyn.centre_of_mass(free, q))
+        (_, c), (h, _) = jax.jvp(state, (q7, v), (jnp.concatenate([jnp.zeros(7), v[6:]]), vdot))
+        wrench = h.at[:3].add(jnp.cross(c, h[3:]))
+        return wrench, sdyn.inverse_dynamics(grounded, q, v[6:], vdot[6:])
+
+    wrench, tau = jax.jit(jax.vmap(known), **QUICKLY)(at.q, at.v, at.vdot)
+    assert np.abs(at.tau - tau).max() < 1e-13 * np.abs(tau).max()
+    assert np.abs(floating.holding(free, at) - wrench).max() < 1e-13 * np.abs(wrench).max()
 
 
 @pytest.mark.parametrize("name", ["reach", "grasp", "identify"])
@@ -155,6 +217,8 @@ def test_the_table_says_what_became_of_each_and_json_holds_it():
         ("reach", [HAND, replace(HAND, goal=planners.Goal(position=(1.0, 0, 0)))], "to all or to none"),
         ("reach", [replace(HAND, goal=planners.Goal(position=(1.0, 0, 0), quaternion=(1.0, 1, 0, 0)))], "quaternion"),
         ("reach", [planners.Structure("hant", ("joint1",))], "'hant'"),
+        ("reach", [replace(HAND, dock="hant")], "'hant'"),
+        ("reach", [replace(HAND, dock="hand")], "'hand' is on the link that is to reach"),
     ],
 )
 def test_what_cannot_be_chosen_is_refused(task, candidates, words):
@@ -174,6 +238,39 @@ def test_the_best_of_two_places_is_found():
     assert choices[0].best.cost == choices[1].best.cost == min(c.cost for c in choices[1].candidates if c.cost)
     assert choices[0].candidates[-1].status == "unreachable" and choices[0].candidates[-1].structure.goal is places[2]
     assert choices[0].task.goal == (choices[0].best.structure.goal or TASK.goal)
+
+
+def test_only_a_reach_by_the_default_solver_is_docked(two_arms):
+    with pytest.raises(ValueError, match="not for the kind 'detumble'"):
+        parse(planners.load("detumble").source.replace("[robot]", '[robot]\ndock = "hand"'))
+    task = variant(two_arms, DOCKED)
+    with pytest.raises(ValueError, match="'foot' is docked"):
+        planners.plan(task, solver="casadi", progress=False)
+    with pytest.raises(ValueError, match="leave dock out"):
+        planners.choose_structure(task)
+
+
+@pytest.mark.slow
+def test_whether_to_dock_is_chosen_as_by_optimising_everything(two_arms):
+    """Swinging about the foot is best here, and better than on a base that is held. What was chosen is planned, and
+    certified: the motion is integrated under the wrench of the dock. One compilation serves free and docked ones.
+    """
+    candidates = [x for x in planners.lockings(two_arms, 1, ("foot",)) if x.frame == "hand"]
+    planners.choose_structure(two_arms, [candidates[0], candidates[5]])  # as it is, and with everything that can move
+    before = len(COMPILED)
+    quick, whole = (planners.choose_structure(two_arms, candidates, drop=drop) for drop in (True, False))
+    assert len(COMPILED) == before
+    assert quick.best.structure == whole.best.structure and quick.best.cost == whole.best.cost
+    assert all(c.status in ("best", "solved") and c.bound <= c.cost for c in whole.candidates)
+    assert quick.best.structure.dock == "foot" and not quick.best.locked and "dock, N m" in str(quick)
+    costs = {(c.structure.dock, c.structure.joints): c.cost for c in whole.candidates}
+    floats, held = (costs[dock, candidates[0].joints] for dock in (None, "foot"))
+    assert quick.best.cost < floats < held
+    plan = planners.plan(quick.task, progress=False)
+    assert plan.status == "solved" and plan.info["results"]["dock"]["force_N"] > 0, plan.verdict
+    off = plan.phases[0].tau * np.r_[np.full(6, 1.01), np.ones(len(quick.task.joints))]
+    spoiled = replace(plan, phases=(replace(plan.phases[0], tau=off),))
+    assert "integrated again" in planners.certify(quick.task, spoiled).sentence
 
 
 @pytest.fixture(scope="module")
