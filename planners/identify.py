@@ -134,22 +134,22 @@ def data(task: Task) -> Data:
     count = len(task.chaser.frames)
     robot = replace(task.chaser, frames=task.chaser.frames + frames)
     widths = {"gyro": 3, "accelerometer": 3, "star_tracker": 3, "torque": n}
-    entries = lambda value: jnp.concatenate([jnp.full(width, value(name)) for name, width in widths.items()])
+    entries = lambda value: np.concatenate([np.full(width, value(name)) for name, width in widths.items()])
     noise = {name: getattr(s, name) for name in widths}
     return Data(
         sdyn.pack(robot),
-        jnp.arange(count, count + len(frames)),
-        jnp.stack([inertial.nominal(robot.link(link))[1] for link in task.unknown.values()]),
-        jnp.asarray(task.start),
+        np.arange(count, count + len(frames)),
+        np.stack([inertial.nominal(robot.link(link))[1] for link in task.unknown.values()]),
+        np.asarray(task.start),
         np.clip(task.position_limits, -1e3, 1e3),
-        jnp.asarray(task.rate_limits),
-        jnp.asarray(task.torque_limits),
-        jnp.asarray(task.limits.margin),
-        jnp.asarray((task.attitude or 3.0) * (1 - task.limits.margin)),
-        jnp.asarray(s.lever),
+        np.asarray(task.rate_limits),
+        np.asarray(task.torque_limits),
+        np.asarray(task.limits.margin),
+        np.asarray((task.attitude or 3.0) * (1 - task.limits.margin)),
+        np.asarray(s.lever),
         entries(lambda name: 0.0 if noise[name] is None else np.sqrt(s.rate) / noise[name]),
         entries(lambda name: float(getattr(s, f"{name}_bias"))),
-        jnp.array([w.information, w.time, w.torque, w.smoothness]),
+        np.array([w.information, w.time, w.torque, w.smoothness]),
     )
 
 
@@ -177,7 +177,7 @@ def waves(rng, shape) -> np.ndarray:
 
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     """The best of some smooth random motions [count, n], scaled."""
-    rng, form = np.random.default_rng(0), problem.form
+    rng, form, numbers = np.random.default_rng(0), problem.form, problem.numbers[0]
     shape = form.blocks[1].shape
     low, high = task.phases["excite"].duration
     guesses = []
@@ -185,7 +185,7 @@ def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
         swing = 0.12 * waves(rng, shape) * task.rate_limits * high
         inside = np.clip(task.start + swing, 0.9 * task.position_limits[:, 0], 0.9 * task.position_limits[:, 1])
         guesses.append(form.join({"duration": [(low + high) / 2], "excite": inside}))
-    merits = [merit(summary(form, z, problem.data), PENALTIES[0]) for z in guesses]
+    merits = [merit(summary(form, z, numbers), PENALTIES[0]) for z in guesses]
     return np.stack(guesses)[np.argsort(merits, kind="stable")[:count]]
 
 

@@ -216,7 +216,9 @@ _optimised, _quick = (jax.jit(arrive, static_argnums=0, **options) for options i
 
 
 def _arrive(form: Form, *rest) -> State:
-    return (_quick if form.quick else _optimised)(form, *rest)
+    """The state, its numbers on the host, where comparing them compiles nothing."""
+    state = (_quick if form.quick else _optimised)(form, *rest)
+    return jax.tree.map(lambda x: x if x.ndim else np.asarray(x)[()], state)
 
 
 def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
@@ -232,8 +234,11 @@ def _blank(problem: Problem, z) -> tuple[State, Step, Found]:
 
 
 def near(problem: Problem, z, numbers=None) -> Linear:
-    """The problem near a point z [n] (scaled), by what `solve` compiles; with other numbers than its own if given."""
-    return _arrive(problem.form, *_blank(problem, z), numbers or problem.numbers).near
+    """The problem near a point z [n] (scaled), by what `solve` compiles; with other numbers than its own if given.
+
+    Its arrays are the host's: what is made of them compiles nothing.
+    """
+    return jax.tree.map(np.asarray, _arrive(problem.form, *_blank(problem, z), numbers or problem.numbers).near)
 
 
 def compile_all(problem: Problem) -> None:
@@ -299,8 +304,8 @@ def residual(s: State) -> float:
 def _polished(form, s: State, numbers) -> State | None:
     """The state after Newton's step on the constraints that hold; None without one that is short."""
     _, low, high = numbers
-    near, z, y, u = (jax.tree.map(np.asarray, x) for x in (s.near, s.z, s.y, s.u))
-    found = newton.step(near, near.curvature + s.left_out, z, y, u, low, high)
+    near, z, y, u, left_out = (jax.tree.map(np.asarray, x) for x in (s.near, s.z, s.y, s.u, s.left_out))
+    found = newton.step(near, near.curvature + left_out, z, y, u, low, high)
     if found is None:  # what was learnt farther away is not the curvature of a minimum
         s = s._replace(left_out=np.zeros_like(near.curvature))
         found = newton.step(near, near.curvature, z, y, u, low, high)

@@ -123,7 +123,7 @@ class PlanTable:
     def _checked(self, point, task, entry) -> Check:
         variables, bound = self.guess(point)
         problem = importlib.import_module(f"planners.{task.kind}").problem(task)
-        at = summary(problem.form, problem.form.join(variables), problem.data)
+        at = summary(problem.form, problem.form.join(variables), problem.numbers[0])
         error = {name: float(np.abs(x - entry.variables[name]).max()) for name, x in variables.items()}
         cost = sum(w * self.entries[k].cost for k, w in self.lattice.weights(point).items())
         error |= {"cost": abs(cost - entry.cost)}

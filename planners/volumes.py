@@ -39,7 +39,7 @@ def _random(task, problem, variables, rng) -> dict:
     for _ in range(HALVINGS):
         size = (small + large) / 2
         motion = variables | {"excite": task.start + size * swing}
-        kept = summary(form, form.join(motion), problem.data).below.max() <= 0
+        kept = summary(form, form.join(motion), problem.numbers[0]).below.max() <= 0
         small, large = (size, large) if kept else (small, size)
     return variables | {"excite": task.start + small * swing}
 
