@@ -5,18 +5,24 @@
 
 States live on a manifold: `move(x, dx)` goes along a tangent, `gap(a, b)` is the tangent from b to a. Bounds are kept
 by a barrier mu with multipliers zl and zu (primal-dual), gaps close as the steps are taken. With A, B the derivatives
-of f, d the gaps, H and g the Gauss-Newton model of the cost and the barrier, a step is the solution of a
-linear-quadratic problem: backward over the knots, with
+of f, d the gaps, g the gradient of the cost and the barrier and H the curvature of the Lagrangian, a step is the
+solution of a linear-quadratic problem: backward over the knots, with
 
     V_k(dx; nu) = dx'P dx/2 + p'dx + nu'(G'dx + c) - nu'S nu/2,
     Quu = Huu + B'P B + reg 1,   du = K dx + k + Ke nu,
 
-then nu, the multipliers of e, from what is left free at the start, and forward again, by the dynamics themselves. A
-line search on cost, barrier and the sum of gaps and |e| takes as much of the step as helps; where that is little, reg
-grows. C, learnt from step to step, is added to H: it is most of the curvature where the duration is free.
+then nu, the multipliers of e, from what is left free at the start, and forward again, by the dynamics themselves. V_N
+has rho |E dx + e|^2 / 2 besides, which moves no solution but bends up what e holds; where some Quu is not positive all
+the same, stages lose their negative curvature. A line search takes as much of the step as lowers
+
+    cost + barrier + penalty * sum of gaps + nu'e + rho |e|^2 / 2,
+
+of which every such step is a direction of descent, and the last ones are taken whole; |e| in the place of the last two
+terms would ask for a thirtieth of a step where e bends more than the cost does. Where little is taken, reg grows.
 
 Source: Rao, Wright and Rawlings (1998), Application of interior-point methods to model predictive control; Nocedal and
-Wright (2006), chapters 18 and 19; Waechter and Biegler (2006), sections 2 and 3 (the barrier and its multipliers).
+Wright (2006), chapters 17 (augmented Lagrangian), 18 and 19; Waechter and Biegler (2006), sections 2 and 3 (the barrier
+and its multipliers).
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +43,7 @@ TO_BOUNDARY, SUFFICIENT, HALVINGS = 0.995, 1e-4, 12
 RESUMED = 1e-7  # barrier of a start from an earlier solution
 REGULARISED = (1e-4, 1e8)  # smallest, and where the solver gives up
 SHORT_LONG = (0.2, 0.8)  # parts of a step, below which reg grows and above which it falls
-UNSURE = 1e-4  # cosine of a step and what it tells of the curvature, below which that is left alone
+AUGMENTED = 100.0  # rho: more than multipliers of e that cost about 1, times how much e bends
 REDUNDANT = 1e-11  # of scaled rows of e: what depends on others gets the multiplier of least change
 
 
@@ -48,9 +54,11 @@ class Near(NamedTuple):
     A: jax.Array  # [N, x, x]
     B: jax.Array  # [N, x, u]
     d: jax.Array  # [N, x] gaps
-    H: jax.Array  # [N, x + u, x + u]
+    H: jax.Array  # [N, x + u, x + u] Gauss-Newton
+    C: jax.Array  # [N, x + u, x + u] what that leaves out of the curvature of the Lagrangian
     g: jax.Array  # [N, x + u]
     H_end: jax.Array  # [x, x]
+    C_end: jax.Array  # [x, x] likewise
     g_end: jax.Array  # [x]
     e: jax.Array  # [e]
     E: jax.Array  # [e, x]
@@ -77,9 +85,7 @@ class State(NamedTuple):
     zl: jax.Array  # [N + 1, x] multipliers of the lower bounds
     zu: jax.Array  # [N + 1, x]
     mu: jax.Array  # [] barrier
-    C: jax.Array  # [N, x + u, x + u] curvature that Gauss-Newton leaves out
-    last: tuple  # step [N, x + u], and A, B, g before it
-    penalty: jax.Array  # [] of the gaps and of e
+    penalty: jax.Array  # [] of the gaps
     reg: jax.Array  # []
     step: jax.Array  # [] part of the last step that was taken
     cost: jax.Array  # []
@@ -98,11 +104,8 @@ def begin(form, data, x, u) -> State:
     low, high = _slacks(form, data, x)
     zero, mu = jnp.zeros(()), jnp.asarray(BARRIERS[0])
     e = jax.eval_shape(lambda x: form.end(x, data)[1], jax.tree.map(lambda y: y[-1], x))
-    (count, m), size = u.shape, at.shape[1]
-    none = lambda *shape: jnp.zeros((count, *shape))
-    last = none(size + m), none(size, size), none(size, m), none(size + m)
     return State(
-        x, u, jnp.zeros(at.shape), jnp.zeros(e.shape), mu / low, mu / high, mu, none(size + m, size + m), last,
+        x, u, jnp.zeros(at.shape), jnp.zeros(e.shape), mu / low, mu / high, mu,
         zero + 1, zero, zero, zero, zero + 1, zero + 1, jnp.zeros((), int), jnp.zeros((), int),
     )  # fmt: skip
 
@@ -123,8 +126,7 @@ def resumed(form, data, s: State, gone) -> State:
     low, high = _slacks(form, data, new.x)
     mu = jnp.asarray(RESUMED)
     held = lambda z, slack: jnp.clip(mixed(z), mu / (10 * slack), 10 * mu / slack)
-    known = dict(lam=mixed(s.lam), nu=s.nu, C=s.C[k[:-1]])
-    return new._replace(mu=mu, zl=held(s.zl, low), zu=held(s.zu, high), **known)
+    return new._replace(mu=mu, lam=mixed(s.lam), nu=s.nu, zl=held(s.zl, low), zu=held(s.zu, high))
 
 
 def solve(form, data, state: State, until) -> State:
@@ -133,7 +135,8 @@ def solve(form, data, state: State, until) -> State:
     Args:
         form: Hashable; what is compiled: `move`, `gap`, `bounded` (the entries of a state that bounds hold, laid out
             like a tangent), `bounds(data)` ([N + 1, x] each), `start(data)` (a state, and 1 for what of its tangent is
-            given), `stage(x, u, data)` -> (x of the next knot, r) and `end(x, data)` -> (r, e, smooth).
+            given), `stage(x, u, data)` -> (x of the next knot, r), `rough(x, u, data)`, the same or nearly, which the
+            curvature is of, and `end(x, data)` -> (r, e, smooth).
         data: Numbers that the form reads, any pytree; all traced.
         state: From `begin`, or where an earlier call stopped.
         until: Number of iterations, traced.
@@ -156,20 +159,18 @@ def iterations(problem: Problem, x, u, most: int):
 
 def advance(form, data, s: State) -> State:
     """One iteration."""
-    near = linearised(form, data, s.x, s.u)
-    s = _judged(form, data, s._replace(C=_curvature(s, near)), near)
+    near = linearised(form, data, s.x, s.u, s.lam, s.nu)
+    s = _judged(form, data, s, near)
     step = newton(form, data, s, near)
     low, high = _slacks(form, data, s.x)
     dzl = (s.mu - s.zl * step.dx) / low - s.zl
     dzu = (s.mu + s.zu * step.dx) / high - s.zu
     longest = jnp.minimum(_longest(low, step.dx), _longest(high, -step.dx))
     dual = jnp.minimum(_longest(s.zl, dzl), _longest(s.zu, dzu))
-    largest = jnp.maximum(jnp.abs(step.lam).max(), jnp.abs(step.nu).max(initial=0.0))
-    penalty = jnp.maximum(s.penalty, 1.2 * largest)
+    penalty = jnp.maximum(s.penalty, 1.2 * jnp.abs(step.lam).max())
     alpha, found, x, u = _search(form, data, s._replace(penalty=penalty), near, step, longest)
     taken = jnp.where(found, alpha, 0.0)
     x, u = jax.tree.map(lambda new, old: jnp.where(found, new, old), (x, u), (s.x, s.u))
-    dx = jax.vmap(form.gap)(_sides(x)[0], _sides(s.x)[0])
     low, high = _slacks(form, data, x)
     held = lambda z, dz, slack: jnp.clip(z + found * dual * dz, s.mu / (1e10 * slack), 1e10 * s.mu / slack)
     least, (short, long) = REGULARISED[0], SHORT_LONG
@@ -179,33 +180,45 @@ def advance(form, data, s: State) -> State:
     new = s._replace(
         x=x, u=u, lam=s.lam + taken * (step.lam - s.lam), nu=s.nu + taken * (step.nu - s.nu),
         zl=held(s.zl, dzl, low), zu=held(s.zu, dzu, high), penalty=penalty, reg=reg, step=taken,
-        last=(jnp.concatenate([dx, u - s.u], axis=1), near.A, near.B, near.g),
         iteration=s.iteration + 1, status=jnp.where(reg > REGULARISED[1], stuck, s.status),
     )  # fmt: skip
     return jax.tree.map(lambda old, new: jnp.where(s.status == RUNNING, new, old), s, new)
 
 
-def linearised(form, data, x, u) -> Near:
-    """The problem near a trajectory: forward mode, one tangent per entry of a stage's state and control."""
-    before, after = _sides(x)
-    size = jax.eval_shape(jax.vmap(form.bounded), x).shape[1]
+def linearised(form, data, x, u, lam, nu) -> Near:
+    """The problem near a trajectory: forward mode, one tangent per entry of a stage's state and control.
 
-    def stage(x, u, after):
+    What Gauss-Newton leaves out, lam . f'' + r . r'', is that of the rough stage: a gradient, and tangents of it.
+    """
+    before, after = _sides(x)
+    size, held = jax.eval_shape(jax.vmap(form.bounded), x).shape[1], jax.lax.stop_gradient
+
+    def stage(x, u, after, lam):
+        moved = lambda z: (form.move(x, z[:size]), u + z[size:], data)
+
         def f(z):
-            new, r = form.stage(form.move(x, z[:size]), u + z[size:], data)
+            new, r = form.stage(*moved(z))
             return form.gap(new, after), r
 
-        (d, r), (F, R) = _with_jacobian(f, size + u.shape[0])
-        return r @ r / 2, F[:, :size], F[:, size:], d, R.T @ R, R.T @ r
+        def weighed(z):
+            new, r = form.rough(*moved(z))
+            return lam @ form.gap(new, held(new)) + held(r) @ r
+
+        (d, r), (F, R) = _with_jacobian(f, size + u.size)
+        return r @ r / 2, F[:, :size], F[:, size:], d, R.T @ R, _bent(weighed, size + u.size), R.T @ r
 
     def end(dx):
-        r, e, smooth = form.end(form.move(last, dx), data)
-        return r, e, smooth
+        return form.end(form.move(last, dx), data)
 
-    cost, A, B, d, H, g = jax.vmap(stage)(before, u, after)
+    def end_weighed(dx):
+        r, e, smooth = end(dx)
+        return held(r) @ r + nu @ e + smooth
+
+    cost, A, B, d, H, C, g = jax.vmap(stage)(before, u, after, lam[1:])
     last = jax.tree.map(lambda y: y[-1], x)
     (r, e, smooth), (R, E, slope) = _with_jacobian(end, size)
-    return Near(cost.sum() + r @ r / 2 + smooth, A, B, d, H, g, R.T @ R, R.T @ r + slope, e, E)
+    cost, H_end, g_end = cost.sum() + r @ r / 2 + smooth, R.T @ R, R.T @ r + slope
+    return Near(cost, A, B, d, H, C, g, H_end, _bent(end_weighed, size), g_end, e, E)
 
 
 def _sides(x):
@@ -219,19 +232,10 @@ def _with_jacobian(f, size):
     return jax.vmap(along, out_axes=(None, -1))(jnp.eye(size))
 
 
-def _curvature(s: State, near: Near):
-    """What Gauss-Newton leaves out of the curvature of the stages' Lagrangians, learnt from the last step: the least
-    symmetric change of rank one after which it explains the change of their gradients."""
-    dz, A, B, g = s.last
-
-    def stage(C, H, dz, lam, before, after):
-        gradient = lambda A, B, g: g + jnp.concatenate([A.T @ lam, B.T @ lam])
-        w = gradient(*after) - gradient(*before) - (H + C) @ dz
-        along = w @ dz
-        sure = jnp.abs(along) > UNSURE * jnp.sqrt((w @ w) * (dz @ dz))
-        return C + jnp.where(sure, 1 / jnp.where(sure, along, 1.0), 0.0) * jnp.outer(w, w)
-
-    return jax.vmap(stage)(s.C, near.H, dz, s.lam[1:], (A, B, g), (near.A, near.B, near.g))
+def _bent(f, size):
+    """The second derivatives of a scalar f at zero [size, size]: those of its gradient."""
+    along = lambda dz: jax.jvp(jax.grad(f), (jnp.zeros(size),), (dz,))[1]
+    return jax.vmap(along)(jnp.eye(size))
 
 
 def _convex(H):
@@ -245,17 +249,24 @@ def newton(form, data, s: State, near: Near) -> Step:
     size = near.A.shape[1]
     low, high = _slacks(form, data, s.x)
     bent, slope = s.zl / low + s.zu / high, s.mu / high - s.mu / low
-    H = jax.vmap(_convex)(near.H + s.C).at[:, :size, :size].add(jax.vmap(jnp.diag)(bent[:-1]))
-    g = near.g.at[:, :size].add(slope[:-1])
+    g, g_end = near.g.at[:, :size].add(slope[:-1]), near.g_end + slope[-1] + AUGMENTED * near.E.T @ near.e
     given, r = form.start(data)[1], _late(form, data, s.x)
-    value = near.H_end + jnp.diag(bent[-1]), near.g_end + slope[-1], near.E.T, near.e, jnp.zeros((near.e.size,) * 2)
-    (P, p, G, c, S), plan = jax.lax.scan(
-        lambda value, stage: _backward(value, stage, s.reg), value, (near.A, near.B, near.d, H, g), reverse=True
-    )
-    # at the start, what is given moves by r, and the rest is where V_0 is least
     free = 1 - given
-    inverse = jax.scipy.linalg.cho_factor(P * jnp.outer(free, free) + jnp.diag(given))
-    least = lambda b: jax.scipy.linalg.cho_solve(inverse, b * (free if b.ndim == 1 else free[:, None]))
+
+    def backward(H, H_end):
+        """Factor of V_0 where the start is free, not finite if some Quu is not positive; V_0, the plan, and V_N."""
+        H = H.at[:, :size, :size].add(jax.vmap(jnp.diag)(bent[:-1]))
+        H_end = H_end + jnp.diag(bent[-1]) + AUGMENTED * near.E.T @ near.E
+        value, stages = (H_end, g_end, near.E.T, near.e, jnp.zeros((near.e.size,) * 2)), (near.A, near.B, near.d, H, g)
+        first, plan = jax.lax.scan(lambda value, stage: _backward(value, stage, s.reg), value, stages, reverse=True)
+        start = first[0] * jnp.outer(free, free) + jnp.diag(given)
+        return jax.scipy.linalg.cholesky(start, lower=True), first, plan, H_end
+
+    H, H_end = near.H + near.C, near.H_end + near.C_end
+    exact, convex = backward(H, H_end), lambda: backward(jax.vmap(_convex)(H), _convex(H_end))
+    factor, (P, p, G, c, S), plan, H_end = jax.lax.cond(jnp.isfinite(exact[0]).all(), lambda: exact, convex)
+    # at the start, what is given moves by r, and the rest is where V_0 is least
+    least = lambda b: jax.scipy.linalg.cho_solve((factor, True), b * (free if b.ndim == 1 else free[:, None]))
     rest, turned = r - least(p + P @ r), least(G)
     S, c = S + G.T @ turned, c + G.T @ rest
     scale = jnp.diagonal(S)
@@ -272,7 +283,7 @@ def newton(form, data, s: State, near: Near) -> Step:
         return A @ dx + B @ du + d, (dx, du, P @ dx + p + G @ nu)
 
     last, (dx, du, lam) = jax.lax.scan(forward, dx0, ((near.A, near.B, near.d), plan))
-    end = (near.H_end + jnp.diag(bent[-1])) @ last + near.g_end + slope[-1] + near.E.T @ nu
+    end = H_end @ last + g_end + near.E.T @ nu
     K, k, Ke = plan[:3]
     return Step(jnp.concatenate([dx, last[None]]), du, jnp.concatenate([lam, end[None]]), nu, K, k + Ke @ nu)
 
@@ -354,10 +365,11 @@ def _search(form, data, s: State, near: Near, step: Step, longest):
     """The largest of `longest` and its halves that lowers the merit enough, if there is one, and where it leads."""
     low, high = _slacks(form, data, s.x)
     gaps, size = sum(jnp.abs(x).sum() for x in (near.d, _late(form, data, s.x))), near.A.shape[1]
-    open_by = gaps + jnp.abs(near.e).sum()
+    priced = lambda e: step.nu @ e + AUGMENTED / 2 * e @ e
     slope = (near.g[:, :size] * step.dx[:-1]).sum() + (near.g[:, size:] * step.du).sum() + near.g_end @ step.dx[-1]
-    slope += (s.mu * step.dx * (1 / high - 1 / low)).sum() - s.penalty * open_by
-    merit = near.cost + _barrier(s.mu, low, high) + s.penalty * open_by
+    slope += (s.mu * step.dx * (1 / high - 1 / low)).sum() - s.penalty * gaps
+    slope -= step.nu @ near.e + AUGMENTED * near.e @ near.e
+    merit = near.cost + _barrier(s.mu, low, high) + s.penalty * gaps + priced(near.e)
     slack = 1e-13 * (1 + jnp.abs(merit))  # what rounding does to the merit
 
     def halve(carry):
@@ -366,7 +378,7 @@ def _search(form, data, s: State, near: Near, step: Step, longest):
         x, u, cost, e = _moved(form, data, s, near, step, alpha)
         left = _slacks(form, data, x)
         inside = sum(jnp.sum(new < (1 - TO_BOUNDARY) * old) for new, old in zip(left, (low, high), strict=True)) == 0
-        new = cost + _barrier(s.mu, *left) + s.penalty * ((1 - alpha) * gaps + jnp.abs(e).sum())
+        new = cost + _barrier(s.mu, *left) + s.penalty * (1 - alpha) * gaps + priced(e)
         good = inside & (new <= merit + SUFFICIENT * alpha * jnp.minimum(slope, 0.0) + slack)
         return alpha, good, k + 1, x, u
 

@@ -98,15 +98,19 @@ class Shooting:
         """What acts, laid out like v."""
         return jnp.concatenate([jnp.zeros(6), acts])
 
-    def stage(self, x: State, u, data: Data):
+    def stage(self, x: State, u, data: Data, steps: int = STEPS):
         """The state at the next knot, and what half the squares of are the cost in between."""
         h = x.T / self.intervals
         force = lambda t, q, v: self.force(x.acts + t / h * (u - x.acts))
-        qs, vs = sdyn.rollout(data.chain, x.q, x.v, force, h / STEPS, steps=STEPS)
+        qs, vs = sdyn.rollout(data.chain, x.q, x.v, force, h / steps, steps=steps)
         mean, change = (x.acts + u) / 2, (u - x.acts) / np.sqrt(12)
         effort = jnp.sqrt(2 * h * data.effort) * jnp.stack([mean, change])
-        smooth = jnp.sqrt(2 * data.smoothness * STEPS / h) * jnp.diff(vs[:, 6:], axis=0)
+        smooth = jnp.sqrt(2 * data.smoothness * steps / h) * jnp.diff(vs[:, 6:], axis=0)
         return State(qs[-1], vs[-1], u, x.T), jnp.concatenate([effort.ravel(), smooth.ravel()])
+
+    def rough(self, x: State, u, data: Data):
+        """The same in one step, exact enough for curvature."""
+        return self.stage(x, u, data, 1)
 
     def end(self, x: State, data: Data):
         """Residuals of the cost at the end, of which there are none, what must be zero there, and the cost of time."""
