@@ -23,6 +23,13 @@ OPTIONS = {
     "ipopt.constr_viol_tol": 1e-10,
     "ipopt.bound_relax_factor": 0.0,
 }
+NEAR = {  # for a start that is all but a minimum: stay near the limits that it touches
+    "ipopt.mu_init": 1e-5,
+    "ipopt.bound_push": 1e-7,
+    "ipopt.bound_frac": 1e-7,
+    "ipopt.slack_bound_push": 1e-7,
+    "ipopt.slack_bound_frac": 1e-7,
+}
 STATUSES = {"Solve_Succeeded": "solved", "Infeasible_Problem_Detected": "infeasible"}
 
 
@@ -38,6 +45,9 @@ class Programme:
         problem: Whose variables come first, and whose rows `equal` and `below` add, in its order.
         z: First guess of them, scaled.
     """
+
+    near = False
+    """Whether the first guess is all but a minimum."""
 
     def __init__(self, problem: Problem, z):
         self.problem, self.cost = problem, ca.MX(0)
@@ -81,7 +91,7 @@ class Programme:
     def solver(self) -> ca.Function:
         """IPOPT for the programme as it is; making it takes seconds."""
         x, g = ca.vertcat(*map(ca.vec, self.symbols)), ca.vertcat(*(row[0] for row in self._in_order()))
-        return ca.nlpsol("referee", "ipopt", {"x": x, "f": self.cost, "g": g}, OPTIONS)
+        return ca.nlpsol("referee", "ipopt", {"x": x, "f": self.cost, "g": g}, OPTIONS | NEAR if self.near else OPTIONS)
 
     def _in_order(self):
         return [row for rows in self.rows.values() for row in rows]
@@ -117,6 +127,8 @@ class Programme:
         )
 
 
-def programme(task, problem: Problem, z) -> Programme:
-    """A task in CasADi, to be started from variables z of its problem, scaled."""
-    return importlib.import_module(f"planners.referee_{task.kind}").programme(task, problem, z)
+def programme(task, problem: Problem, z, near: bool = False) -> Programme:
+    """A task in CasADi, to be started from scaled variables z of its problem; `near` if those are all but a minimum."""
+    nlp = importlib.import_module(f"planners.referee_{task.kind}").programme(task, problem, z)
+    nlp.near = near
+    return nlp
