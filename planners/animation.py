@@ -13,7 +13,7 @@ import numpy as np
 
 from planners import solids
 from planners.motion import continuous, follow, quaternions, rotations
-from planners.shapes import ORANGE, extent, keep_out, robot_shapes
+from planners.shapes import ORANGE, Shape, extent, keep_out, robot_shapes
 
 FRAMES_PER_SECOND = 25.0
 MAX_FRAMES = 1500  # of a long plan; what is slow looks smooth with fewer
@@ -109,6 +109,8 @@ def _page(plan) -> str:
         low, high = _bounds(motion, shapes)
         _place_camera(server.initial_camera, low, high)
         nodes = _build(server.scene, shapes, parents)
+        for shape in _goal(plan.task, shapes):
+            _add(server.scene, "/goal", shape)
         labels = _labels(server.scene, plan, ((low + high) / 2)[:2], high[2])
         recorder = server.get_scene_serializer()
         moves = {name: _seen_from(motion.get(parents[name]), motion[name]) for name in motion}
@@ -127,6 +129,17 @@ def _shapes(plan) -> dict:
     for solid in plan.task.shapes.values():
         shapes[solid.link] = [*shapes[solid.link], *keep_out(solid)]
     return shapes
+
+
+def _goal(task, shapes) -> list[Shape]:
+    """What shows where a reach is to end, world axes: the hand's axes, larger; a ball where any orientation will do."""
+    if task.goal is None:
+        return []
+    longest = max(shape.size[0] for own in shapes.values() for shape in own if shape.kind == "axes")
+    place = np.array(task.goal.position)
+    if task.goal.quaternion is None:
+        return [Shape("ball", (longest / 2,), place, color=ORANGE, opacity=0.5)]
+    return [Shape("axes", (2 * longest,), place, rotations(np.array([task.goal.quaternion]))[0])]
 
 
 def _parents(plan) -> dict[str, str | None]:

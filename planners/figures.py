@@ -16,6 +16,7 @@ from planners.motion import continuous, follow, quaternions
 
 BLUE, RED, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#A0A0A0"  # Okabe and Ito's palette
 BANDS = ("#E8E8E8", "#DCEBF7", "#FCE9CF", "#DDF1E7", "#F4E3EE")
+ROUNDING = 1e-9  # of the largest momentum: less is drawn as none
 FAR = 5.0  # a limit this many times beyond the curve is named, not drawn
 
 
@@ -117,7 +118,7 @@ def _limits(panel, values, pair):
         text = f"\u00b1{far[1]:.3g}" if same else " and ".join(f"{x:.3g}" for x in far)
         panel.text(0.99, 0.97, f"limit {text}", transform=panel.transAxes, ha="right", va="top", fontsize=7, color=RED)
     low, high = min([low, *near]), max([high, *near])
-    room = 0.08 * max(high - low, 1e-9)
+    room = 0.08 * max([high - low, 1e-9, *(1e-3 * abs(x) for x in finite)])  # what is nearly zero looks so
     panel.set_ylim(low - room, high + (2.5 * room if far else room))
 
 
@@ -174,8 +175,11 @@ def momenta(plan, motions) -> Figure:
             for panel, column in zip(panels, (3, 4, 5, 0, 1, 2), strict=True):
                 under = {"linewidth": 4.0, "zorder": 1.5} if name == "total" else {"linewidth": 1.3}
                 panel.plot(phase.times, values[:, column], color=lines[name], **under)
+    largest = max(np.abs(panel.get_ylim()).max() for panel in panels)
     for panel, axis in zip(panels, "xyzxyz", strict=True):
         panel.set_title(axis, fontsize=9, loc="left")
+        if np.abs(panel.get_ylim()).max() < ROUNDING * largest:
+            panel.set_ylim(-largest, largest)
     panels[0].set_ylabel("linear, N s", fontsize=8)
     panels[3].set_ylabel("angular, N m s", fontsize=8)
     return figure

@@ -10,7 +10,7 @@ import pytest
 
 import planners
 import sdyn
-from planners import animation, certify_detumble, detumble, figures, referee
+from planners import animation, certify_detumble, detumble, figures, motion, referee
 from planners.shapes import ORANGE
 from planners.task import FOLDER, TaskError, parse
 
@@ -123,6 +123,10 @@ def test_the_target_is_shown_and_the_wrench_is_drawn(judged):
     figure = figures.wrench(judged)
     assert [axes.get_title(loc="left") for axes in figure.axes][1::3] == ["torque about y", "force along y"]
     assert np.array_equal(figure.axes[1].lines[0].get_ydata(), judged.tau[0][:, 1])
+    assert figure.axes[0].get_ylim()[1] > 1e-4 * judged.task.base_limits[0]  # nothing is about x: not magnified
+    phase = replace(judged.phases[0], v=judged.phases[0].v + 1e-15)  # rounding, across the plane too
+    noisy = replace(judged, phases=(phase,))
+    assert min(panel.get_ylim()[1] for panel in figures.momenta(noisy, motion.follow(noisy)).axes) > 1e-3
 
 
 @pytest.mark.parametrize(

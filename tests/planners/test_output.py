@@ -44,6 +44,7 @@ def plan():
         target=SimpleNamespace(frame="grasp"),
         body=target,
         load_body=None,
+        goal=None,
         shapes={},
         clearance=None,
     )
@@ -224,6 +225,18 @@ def test_a_load_in_the_hand_is_shown_as_a_target_is():
     shown = animation._shapes(SimpleNamespace(task=task, phases=[SimpleNamespace(robot=task.chaser)]))
     assert {shape.color for shape in shown["load_target"]} >= {shapes.ORANGE, shapes.PANEL}
     assert shown.keys() == {link.name for link in task.chaser.links}
+
+
+def test_the_goal_of_a_reach_is_shown_where_the_hand_ends():
+    task = planners.load("reach")
+    shown = animation._shapes(SimpleNamespace(task=task, phases=[SimpleNamespace(robot=task.chaser)]))
+    (goal,) = animation._goal(task, shown)
+    (hand,) = [shape for shape in shown[task.chaser.frame("hand").link] if shape.kind == "axes"]
+    assert goal.kind == "axes" and goal.size[0] == 2 * hand.size[0]
+    np.testing.assert_allclose(motion.quaternions(goal.rotation), task.goal.quaternion, atol=1e-7)
+    anywhere = SimpleNamespace(goal=SimpleNamespace(position=task.goal.position, quaternion=None))
+    (ball,) = animation._goal(anywhere, shown)
+    assert ball.kind == "ball" and tuple(ball.position) == task.goal.position
 
 
 def test_the_box_of_a_box_is_that_box():
