@@ -195,7 +195,7 @@ ROWS = np.array(
 )
 
 
-@jax.jit
+@functools.partial(jax.jit, **ONCE)
 def integrate(chain, q, v, tau, steps):
     """States [k + 1, nq], [k + 1, nv] from torques tau [k, STEP + 1, nv] along k steps [s].
 

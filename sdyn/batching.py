@@ -27,6 +27,8 @@ from sdyn.workspace import Workspace
 BLOCKS, CACHE = (8, 128), 5 << 20
 """Samples or columns that a CPU works on at once, at least and at most: long rows, and storages that fit a cache
 [bytes]. Measured: chains of 100 to 1000 joints are each within a fifth of their best block."""
+FEW = (2, 6)
+"""Samples, and columns of them, for which a kernel is traced to learn shapes."""
 
 
 class Kernel:
@@ -86,17 +88,32 @@ def _abstract(*operands, kernel):
 
 def _shaped(kernel, operands):
     """Shapes and types of the outputs."""
-    return _seen(kernel, *((x.shape, x.dtype) for x in operands))[0]
+    (out, _), real, _ = _seen_in_few(kernel, operands)
+    return [jax.ShapeDtypeStruct((*x.shape[:-1], real[x.shape[-1]]), x.dtype) for x in out]
 
 
 def _storages(kernel, operands):
     """Shapes and types of the storages that the kernel asks for."""
-    return _seen(kernel, *((x.shape, x.dtype) for x in operands))[1]
+    (_, stored), real, columns = _seen_in_few(kernel, operands)
+    lead = lambda shape: (*shape[:-2], columns[shape[-2]]) if kernel.grouped else shape[:-1]
+    return [jax.ShapeDtypeStruct((*lead(x.shape), real[x.shape[-1]]), x.dtype) for x in stored]
+
+
+def _seen_in_few(kernel, operands):
+    """What FEW samples and columns are to a kernel, and the sizes and numbers of columns for which theirs stand.
+
+    Shapes of larger batches differ in these alone, and tracing a kernel costs far more than it says about shapes.
+    """
+    s, B = _sizes(operands)
+    few = {s: FEW[0], B: FEW[0] if s == B else FEW[1], 1: 1}
+    size = lambda x: x.shape if _is_index(x) else (*x.shape[:-1], few.get(x.shape[-1], FEW[0]))
+    seen = _seen(kernel, *((size(x), x.dtype) for x in operands))
+    return seen, {few[n]: n for n in few}, {FEW[1] // FEW[0]: B // s, 1: 1}
 
 
 @cache
 def _seen(kernel, *sizes):
-    """Shapes and types of outputs and storages; what follows from shapes is traced once."""
+    """Shapes and types of outputs and storages."""
     work = Workspace()
     out = jax.eval_shape(partial(kernel.run, work=work), *(jax.ShapeDtypeStruct(*size) for size in sizes))
     return out, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in work.storages]
@@ -219,7 +236,7 @@ def _batch(operands, dims, *, kernel):
 
     folded = [fold(x, d, s) for x, d, s in zip(operands, dims, shared, strict=True)]
     out = _primitive.bind(*folded, kernel=kernel)
-    want = [x.shape[-1] for x in _shaped(kernel, single)]
+    want = [1] * len(out) if B == 1 else [x.shape[-1] for x in _shaped(kernel, single)]
 
     def unfold(y, b):  # the sum is the cotangent of an operand that B shared
         if columns:
