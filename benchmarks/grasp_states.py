@@ -5,7 +5,8 @@ lattice of 1.25 degrees/s within the ball of 5 degrees/s, in body axes: 257 stat
 largest, the smallest and the intermediate axis. A success counts only with its certificate. A failure is compared with
 where the handle goes, by inverse kinematics from many postures once a second, the base as it waits: whether the hand
 can be on the handle, and whether the joints can then move as it does, for as long as tracking takes. Where no posture
-is near the handle at any time, only some states are planned all the same; the others count as failures.
+is near the handle at any time, only some states are planned all the same; the others count as failures. Where a plan
+was not found though the handle can be followed, `relax` says what would have to give for one.
 
 A second, fine table about the task's own spin says what interpolating between plans errs by.
 
@@ -31,7 +32,7 @@ import numpy as np
 
 import planners
 import sdyn
-from planners import floating, grasp, seeds
+from planners import floating, grasp, relax, seeds, sqp
 from planners.lattice import Lattice
 from planners.table import NOWHERE, Entry
 
@@ -41,6 +42,8 @@ POSTURES = 5  # from which inverse kinematics starts, each time
 NEAR = 0.05  # m, rad; as the base reacts to the arm, the hand may come somewhat further than from a fixed one
 REACHED = 1e-4  # m, rad
 LEFT, NEIGHBOURS = "not found", 2  # what failed without such a reason is tried again from so many others
+FASTER = 1.0  # rad/s
+SETTLE = 20  # iterations from where that ended, for the multipliers that say which constraints hold
 PARTS = 101, 110  # where the states that are near enough are split into tables, which were planned side by side
 TRIES = 60  # iterations of the solver, each time; those that succeed take about 25
 FAR = 64  # of the states without a posture near the handle at any time, those that are planned all the same
@@ -118,9 +121,10 @@ def least_rates(J, twist, limits) -> float:
 PAIRS = np.array([(i, j, sign) for i, j in itertools.combinations(range(7), 2) for sign in (-1, 1)]).T
 
 
-def again(states, entries, seen, folder) -> list:
+def again(states, entries, seen, folder) -> tuple[list, dict]:
     """The entries, those that failed and could be followed tried again: from where they ended, then from the nearest
-    that are solved, now that all are known.
+    that are solved, now that all are known, then from a plan for faster joints. And, by number, where those ended that
+    failed again.
     """
     solved = [k for k, entry in enumerate(entries) if entry.status == "solved"]
     failed = [k for k, pair in enumerate(zip(entries, seen, strict=True)) if k not in solved and said(*pair)[0] == LEFT]
@@ -128,8 +132,8 @@ def again(states, entries, seen, folder) -> list:
     def work(x, rng):
         k = x["number"]
         near = sorted(solved, key=lambda j: np.linalg.norm(states[j] - states[k]))[:NEIGHBOURS]
-        for j in (k, *near):
-            guess = entries[j].variables
+        for j in (k, *near, NOWHERE):
+            guess = entries[j].variables if j != NOWHERE else loose(task_at(states[k]))
             found = planners.plan(task_at(states[k]), guess=guess, explain=False, iterations=TRIES, progress=False)
             if found.status == "solved":
                 break
@@ -137,15 +141,41 @@ def again(states, entries, seen, folder) -> list:
         out |= {"certificate": found.certificate.to_json() if found.certificate else "", "verdict": found.verdict}
         return {name: np.array(x) for name, x in out.items()} | found.variables
 
-    found, out = planners.study(folder, {str(k): {"number": k} for k in failed}, work), list(entries)
+    found, out, ends = planners.study(folder, {str(k): {"number": k} for k in failed}, work), list(entries), {}
     for k, x in zip(failed, found.values(), strict=True):
         numbers = dict(start=int(x["start"]), iterations=int(x["iterations"]), cost=float(x["cost"]))
+        variables = ends[k] = {name: x[name] for name in entries[k].variables}
         if str(x["status"]) == "solved":
-            variables = {name: x[name] for name in entries[k].variables}
+            del ends[k]
             certificate = planners.Certificate.from_json(str(x["certificate"]))
             words = dict(status="solved", verdict=str(x["verdict"]))
             out[k] = entries[k]._replace(variables=variables, certificate=certificate, **words, **numbers)
-    return out
+    return out, ends
+
+
+def loose(task) -> dict:
+    """The variables of a plan whose joints may be faster than they are."""
+    faster = replace(task, limits=replace(task.limits, rate=FASTER))
+    return planners.plan(faster, explain=False, iterations=TRIES, progress=False).variables
+
+
+def relaxed(states, ends, folder) -> list[dict]:
+    """What would have to give, from where a state's last plan ended, for a plan to be found: one constraint alone, by
+    an amount in its unit, or none if none was found that is enough.
+    """
+
+    def work(x, rng):
+        task = task_at(states[x["number"]])
+        problem = grasp.problem(task)
+        z = problem.form.join(ends[x["number"]])
+        *_, (state,) = sqp.solve(problem, z[None], iterations=SETTLE)
+        end = sqp.outcome(sqp.pick([state], 0))
+        needed = relax.relaxations(problem, end, grasp.first_guesses(task, problem, 1)[0])
+        return {"said": np.array(relax.sentence(needed)), "needed": np.array(json.dumps([n._asdict() for n in needed]))}
+
+    found = planners.study(folder, {str(k): {"number": k} for k in ends}, work)
+    read = lambda x: dict(said=str(x["said"]), needed=json.loads(str(x["needed"])))
+    return [dict(spin=states[k].tolist()) | read(x) for k, x in zip(ends, found.values(), strict=True)]
 
 
 def longest(good) -> int:
@@ -281,8 +311,8 @@ def main(folder):
         planned |= dict(zip(part, table.entries, strict=True))
     around = own_spin() + FINE * np.array([(0, 0, 0), *(x for x in itertools.product((-1, 0, 1), repeat=3) if any(x))])
     fine = planners.table(task_at, around, folder / "fine")
-    entries = again(states, [planned.get(k, UNTRIED) for k in range(len(states))], seen, folder / "again")
-    summary = summed_up(states, entries, seen)
+    entries, ends = again(states, [planned.get(k, UNTRIED) for k in range(len(states))], seen, folder / "again")
+    summary = summed_up(states, entries, seen) | dict(explained=relaxed(states, ends, folder / "relaxed"))
     harness.save("grasp_states", dict(machine=harness.machine(), **summary, interpolation=interpolated(fine)))
     kinds = ["" if e.status == "solved" else said(e, x)[0] for e, x in zip(entries, seen, strict=True)]
     draw(states, entries, kinds, harness.RESULTS / "grasp_states.png")
