@@ -18,6 +18,8 @@ from planners.shapes import ORANGE, Shape, extent, keep_out, robot_shapes
 FRAMES_PER_SECOND = 25.0
 MAX_FRAMES = 1500  # of a long plan; what is slow looks smooth with fewer
 BACKGROUND = (10, 12, 20)
+THIN = 0.03  # m, of a spike
+BLUE, RED = (60, 150, 230), (240, 90, 60)
 VISIBLE = 2e-4  # m, and part of a quaternion: what moves less since it was last drawn is not drawn again
 
 
@@ -111,10 +113,11 @@ def _page(plan) -> str:
         nodes = _build(server.scene, shapes, parents)
         for shape in _goal(plan.task, shapes):
             _add(server.scene, "/goal", shape)
+        spikes = _spikes(server.scene, plan, times, 2 * extent(shapes[plan.phases[0].robot.base]))
         labels = _labels(server.scene, plan, ((low + high) / 2)[:2], high[2])
         recorder = server.get_scene_serializer()
         moves = {name: _seen_from(motion.get(parents[name]), motion[name]) for name in motion}
-        _play(recorder, times, moves, nodes, labels, _phase_masks(plan, times))
+        _play(recorder, times, moves, nodes, labels, _phase_masks(plan, times), spikes)
         page = recorder.as_html(dark_mode=True)
     return _with_heading(page, plan)
 
@@ -222,6 +225,29 @@ def _add(scene, name, shape):
         scene.add_frame(name, axes_length=shape.size[0], axes_radius=0.06 * shape.size[0], **place)
 
 
+def _spikes(scene, plan, times, longest) -> list:
+    """Spikes from the base's origin along the force and along the moment that push it, as long as the part of the limit
+    that is used: (handle, vectors [k, 3]) each; none where nothing can push.
+    """
+    if plan.task.base is None:
+        return []
+    parts = np.zeros((len(times), 6))
+    for phase, now in zip(plan.phases, _phase_masks(plan, times), strict=True):
+        parts[now] = np.stack([np.interp(times[now], phase.times, x) for x in phase.tau[:, :6].T], axis=1)
+    parts = longest * parts / np.maximum(plan.task.base_limits, 1e-300)
+    looks = zip(("moment", "force"), (BLUE, RED), np.split(parts, 2, axis=1), strict=True)
+    node = f"/{plan.phases[0].robot.base}/"
+    return [(scene.add_icosphere(node + name, radius=0.5, color=color), x) for name, color, x in looks if x.any()]
+
+
+def _along(x):
+    """Rotation that turns the z axis along x [3]."""
+    z = x / np.linalg.norm(x)
+    aside = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    y = aside / np.linalg.norm(aside)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
 def _labels(scene, plan, middle, top) -> list:
     """A label for each phase, above the scene; it is shown in its phase only."""
     look = {"position": (*middle, top), "anchor": "bottom-center", "font_screen_scale": 1.5, "visible": False}
@@ -237,7 +263,7 @@ def _closest(plan):
     return [solids.apart(plan.task, *pair)[:, kept].min() for pair in follow(plan)]
 
 
-def _play(recorder, times, motion, nodes, labels, masks):
+def _play(recorder, times, motion, nodes, labels, masks, spikes):
     """Record the motion, frame by frame; a body that rests sends nothing."""
     shown = {}
 
@@ -255,6 +281,13 @@ def _play(recorder, times, motion, nodes, labels, masks):
             if present[k]:
                 put(nodes[name], "wxyz", quaternion[k], VISIBLE)
                 put(nodes[name], "position", position[k], VISIBLE)
+        for spike, vectors in spikes:
+            length = np.linalg.norm(vectors[k])
+            put(spike, "visible", bool(length > THIN))
+            if length > THIN:
+                put(spike, "wxyz", quaternions(_along(vectors[k])), VISIBLE)
+                put(spike, "position", vectors[k] / 2, VISIBLE)
+                put(spike, "scale", (THIN, THIN, float(length)), VISIBLE)
         recorder.insert_sleep(float(times[min(k + 1, len(times) - 1)] - times[k]))
 
 

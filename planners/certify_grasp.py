@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 import sdyn
-from planners import certify_mission
+from planners import balance, certify_mission
 from planners.certify import DRIFT, INTEGRATION, LIMIT, MOMENTUM, Row, largest, see
 from planners.problem import ONCE
 
@@ -20,7 +20,8 @@ def rows(task, plan) -> list[Row]:
     return [
         *_ends(task, plan),
         *_tracking(task.tolerance, robots[len(alone) - 1], targets[-1]),
-        *_momentum(robots, targets),
+        *_momentum(robots, targets, pushed=task.base is not None),
+        *([] if task.base is None else balance.momentum(robots[1:], plan.phases[1:])),
         Row("state after the grasp differs from the jump", gap, 10 * INTEGRATION, "m, rad, m/s, rad/s"),
         *certify_mission.rows(task, plan, impulse),
     ]
@@ -63,8 +64,9 @@ def _tracking(limit, hand, grip):
     return tracking + [Row(f"{name} error at the grasp", float(x[-1]), LIMIT, unit) for name, x, _, unit in table]
 
 
-def _momentum(robots, targets):
-    """Total momentum over the capture, about the compound's centre of mass, and its drift in each phase.
+def _momentum(robots, targets, pushed=False):
+    """Total momentum over the capture, about the compound's centre of mass, and its drift in each phase; of a robot
+    that is pushed, while it waits.
 
     Relative to the parts that add up to it, which are there when the total is zero.
     """
@@ -74,7 +76,8 @@ def _momentum(robots, targets):
     scale = np.max([largest(x.parts) for x in (*robots, *targets)], axis=0)
     relative = lambda change: np.divide(change, scale, out=np.where(change > 0, np.inf, 0.0), where=scale > 0)
     angular, linear = relative(largest(sum(shifted) - after))
-    drift = max(relative(x.drift).max() for x in (*robots, *targets))
+    free = robots[:1] if pushed else robots
+    drift = max(relative(x.drift).max() for x in (*free, *targets))
     return [
         Row("angular momentum lost at the grasp, relative", float(angular), MOMENTUM, ""),
         Row("linear momentum lost at the grasp, relative", float(linear), MOMENTUM, ""),

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
-from planners import floating, flying
+from planners import floating, flying, pushed
 from planners.bspline import Clamped
 from planners.floating import Motion
 from planners.joints import limit_rows, trapezoid, two_sided, within
@@ -73,7 +73,7 @@ class Detumble:
         left = jnp.sqrt(2 * data.end_weights) * v[-1]
         below = (
             within(data, P[:, 6:], self.spline.hull(1) @ P[:, 6:] / T, acting[:, 6:]),
-            two_sided(acting[:, :6] / data.wrench, data.margin - 1, 1 - data.margin),
+            pushed.within(data.wrench, acting[:, :6], data.margin),
             two_sided(P[:, 3:6], -flying.TURN, flying.TURN),
             two_sided((v[-1] / data.rest)[resting], -1.0, 1.0),
         )
@@ -84,9 +84,7 @@ class Detumble:
 def rows(task: Task, values: Detumble) -> tuple[Rows, ...]:
     """Names of the inequalities, in the order of the values."""
     count, points = values.spline.count, values.intervals + 1
-    kinds = ("torque limit of the base about", "N m"), ("force limit of the base along", "N")
-    named = [(f"{words} {axis}", unit) for words, unit in kinds for axis in "xyz"]
-    wrench = [Rows(name, x, unit, (points, 2)) for (name, unit), x in zip(named, task.base_limits, strict=True)]
+    wrench = pushed.limit_rows(task.base_limits, points)
     turn = Rows("turn of the base", 1.0, "rad", (3, count, 2))
     speed, joints = task.end.speed, len(values.resting) - 6
     base = Rows("velocity of the base at the end", speed * 3**-0.5, "rad/s, m/s", (6, 2))

@@ -39,7 +39,7 @@ def draw(plan, folder) -> list[Path]:
         figures["grasp"] = grasp(plan, motions)
         if plan.task.clearance:
             figures["clearance"] = clearance(plan, motions)
-    if plan.task.kind == "detumble":
+    if plan.task.base:
         figures["wrench"] = wrench(plan)
     if plan.task.kind == "identify":
         figures |= {"gyro": gyro(plan, motions), "information": information(plan)}
@@ -148,17 +148,18 @@ def base(plan, motions) -> Figure:
 
 
 def wrench(plan) -> Figure:
-    """Moment and force of the thrusters on the base, its axes."""
-    figure, panels = _sheet(plan, "What the thrusters do", 6, columns=3, height=2.3, dashed="limit")
+    """Moment and force on the base, its axes; moments alone where only its attitude is controlled."""
+    count = 3 if plan.task.base.force is None else 6
+    figure, panels = _sheet(plan, "What pushes the base", count, columns=3, height=2.3, dashed="limit")
     titles = [f"{what} {axis}" for what in ("torque about", "force along") for axis in "xyz"]
-    for k, (panel, title, most) in enumerate(zip(panels, titles, plan.task.base_limits, strict=True)):
+    for k, (panel, title, most) in enumerate(zip(panels, titles, plan.task.base_limits, strict=False)):
         curves = [(phase.times, phase.tau[:, k]) for phase in plan.phases]
         for times, values in curves:
             panel.plot(times, values, color=BLUE, linewidth=1.3)
         panel.set_title(title, fontsize=9, loc="left")
         _limits(panel, np.concatenate([values for _, values in curves]), (-most, most))
-    panels[0].set_ylabel("N m", fontsize=8)
-    panels[3].set_ylabel("N", fontsize=8)
+    for panel, unit in zip(panels[::3], ("N m", "N"), strict=False):
+        panel.set_ylabel(unit, fontsize=8)
     return figure
 
 

@@ -11,6 +11,7 @@ All that depends on the joints is computed for all points at once; the scan over
 Source: Yoshida and Umetani, momentum of free-floating manipulators; Munthe-Kaas, Runge-Kutta methods on Lie groups.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -136,68 +137,74 @@ def base_position(c: Coupling, R, time, momentum: Momentum):
     return momentum.centre + momentum.linear * (time / c.mass) - R @ c.centre
 
 
-def advance(R, compliance, drive, angular, step):
-    """One step of Munthe-Kaas RK4 of R' = R hat(w), w = J R^T L + g.
+def advance(R, compliance, drive, angular, step, moments=None):
+    """One step of Munthe-Kaas RK4 of R' = R hat(w), w = J R^T L + g, L' = R n.
 
     Args:
         R: Attitude [3, 3].
         compliance, drive: J and g at the start, middle and end of the step, three of each.
-        angular: L [3], world axes.
+        angular: L [3] at the start, world axes.
         step: Length of the step [s].
+        moments: n as J and g, base axes; None for none.
+
+    Returns:
+        R and L at the end.
     """
     momentum = R.T @ angular
 
     def stage(carry, row):  # a loop: it is compiled once, not once a stage
-        k, total = carry
-        (part, weight), J, g = row
+        (k, gain), total = carry
+        (part, weight), J, g, n = row
         theta = part * step * k
-        w = J @ (exponential(-theta) @ momentum) + g
+        back = exponential(-theta)
+        w = J @ (back @ (momentum if n is None else momentum + part * step * gain)) + g
         turn = cross(theta, w)
-        k = w + turn / 2 + cross(theta, turn) / 12
-        return (k, total + weight * k), None
+        rates = w + turn / 2 + cross(theta, turn) / 12, None if n is None else back.T @ n
+        return (rates, jax.tree.map(lambda x, rate: x + weight * rate, total, rates)), None
 
     along = lambda x: jnp.stack([x[0], x[1], x[1], x[2]])
     still = jnp.zeros_like(momentum)
-    rows = STAGES.astype(momentum.dtype), along(compliance), along(drive)
-    (_, mean), _ = jax.lax.scan(stage, (still, still), rows)
-    return R @ exponential(step * mean)
+    still = still, None if moments is None else still
+    rows = STAGES.astype(momentum.dtype), along(compliance), along(drive), None if moments is None else along(moments)
+    (_, (mean, gained)), _ = jax.lax.scan(stage, (still, still), rows)
+    return R @ exponential(step * mean), angular if gained is None else angular + step * R @ gained
 
 
 def attitudes(R0, compliance, drive, angular, steps):
     """Attitudes [k + 1, 3, 3] along a grid: the arguments of `advance`, for k steps each."""
     k = len(steps)
     stages = jnp.concatenate([x.reshape(k, -1) for x in (*compliance, *drive, angular, steps)], axis=1)
-    return _march(R0.ravel(), stages).reshape(k + 1, 3, 3)
+    return march(_step, R0.ravel(), stages).reshape(k + 1, 3, 3)
 
 
 def _step(x):
     """`advance` of its arguments in one row [49], as a row [9]."""
     R, J, g, angular = x[:9].reshape(3, 3), x[9:36].reshape(3, 3, 3), x[36:45].reshape(3, 3), x[45:48]
-    return advance(R, J, g, angular, x[48]).ravel()
+    return advance(R, J, g, angular, x[48])[0].ravel()
 
 
-@jax.custom_jvp
-def _march(R0, stages):
-    """Attitudes [k + 1, 9] from the first one and the other arguments of each step [k, 40].
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def march(step, first, stages):
+    """States [k + 1, m] from the first one [m] and the other arguments of each step [k, ...], a row both for `step`.
 
     Its derivative is one small Jacobian per step, all made at once, and a loop of matrix products.
     """
 
-    def step(R, stage):
-        R = _step(jnp.concatenate([R, stage]))
-        return R, R
+    def onwards(state, stage):
+        state = step(jnp.concatenate([state, stage]))
+        return state, state
 
-    _, R = jax.lax.scan(step, R0, stages)
-    return jnp.concatenate([R0[None], R])
+    _, states = jax.lax.scan(onwards, first, stages)
+    return jnp.concatenate([first[None], states])
 
 
-@_march.defjvp
-def _(primals, tangents):
-    R = _march(*primals)
-    J = jax.vmap(jax.jacfwd(_step))(jnp.concatenate([R[:-1], primals[1]], axis=1))
-    causes = jnp.einsum("kij,kj->ki", J[:, :, 9:], tangents[1])
-    _, changes = jax.lax.scan(lambda d, row: (row[0] @ d + row[1],) * 2, tangents[0], (J[:, :, :9], causes))
-    return R, jnp.concatenate([tangents[0][None], changes])
+@march.defjvp
+def _(step, primals, tangents):
+    states, m = march(step, *primals), len(primals[0])
+    J = jax.vmap(jax.jacfwd(step))(jnp.concatenate([states[:-1], primals[1]], axis=1))
+    causes = jnp.einsum("kij,kj->ki", J[:, :, m:], tangents[1])
+    _, changes = jax.lax.scan(lambda d, row: (row[0] @ d + row[1],) * 2, tangents[0], (J[:, :, :m], causes))
+    return states, jnp.concatenate([tangents[0][None], changes])
 
 
 def thirds(x):
@@ -252,18 +259,20 @@ def drift(c: Coupling, rates):
     return -jnp.einsum("kij,kjl,kl->ki", c.compliance, c.angular, rates)
 
 
-def free_torques(chains, c: Coupling, joints, v, accelerations, floats=1.0):
-    """Joint torques and accelerations of free-floating motion without external forces.
+def free_torques(chains, c: Coupling, joints, v, accelerations, floats=1.0, push=None):
+    """Joint torques and accelerations of free-floating motion without external forces but for a push on the base.
 
     Args:
         chains, c: The chain, or k stacked ones, and k couplings.
         joints, v, accelerations: Joint positions [k, n], velocities [k, nv], joint accelerations [k, n].
         floats: 0 if the base is held at rest instead.
+        push: Moment about the base's origin and force [k, 6], base axes; None for none.
 
     Returns:
         (tau [k, n], vdot [k, nv]): torques [N m] and accelerations of the components of v.
     """
     wrench = _wrenches(chains, jnp.concatenate([joints, v, accelerations], axis=1))
+    wrench = wrench if push is None else wrench.at[:, :6].add(-push)
 
     def one(c, wrench, qdd):
         push = -floats * wrench[3:6] / c.mass  # acceleration that the centre of mass lacks
@@ -284,6 +293,7 @@ class Motion(NamedTuple):
     v: jax.Array  # [k + 1, 6 + n]
     vdot: jax.Array  # [k + 1, 6 + n]
     tau: jax.Array  # [k + 1, n]
+    push: jax.Array | None = None  # [k + 1, 6] moment about the base's origin and force, base axes
 
 
 def holding(chain, at: Motion):
@@ -347,7 +357,7 @@ def _attitude(body: Tumble, time):
     """Attitude of the body, a constant, at a time; its derivative is that of the motion, R hat(w)."""
     cell = jnp.clip(jnp.floor(time / body.step).astype(int), 0, len(body.rotations) - 2)
     J, g = (body.coupling.compliance,) * 3, (jnp.zeros(3),) * 3
-    return advance(body.rotations[cell], J, g, body.momentum.angular, time - cell * body.step)
+    return advance(body.rotations[cell], J, g, body.momentum.angular, time - cell * body.step)[0]
 
 
 @_attitude.defjvp

@@ -1,9 +1,10 @@
-"""The grasp of a tumbling target by a free-floating arm, as a problem.
+"""The grasp of a tumbling target by an arm on a free base, as a problem.
 
 Variables: four durations; the joints' state (position, rate, acceleration) where tracking starts and where the grasp
 is; the joints' end; inner control points of a quintic spline for each phase. The splines join with continuous
 accelerations and start and end at rest by construction. The base follows from momentum, before and after the grasp;
-torques from inverse dynamics. At the grasp the target joins the chain: momenta add, the joints' path goes on.
+torques from inverse dynamics. At the grasp the target joins the chain: momenta add, the joints' path goes on. A base
+that is pushed changes the momenta by splines of its own (`pushed.py`), and is then no other problem.
 """
 
 import functools
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sdyn
-from planners import floating, mission
+from planners import floating, mission, pushed
 from planners.bspline import Clamped
 from planners.floating import Momentum, Motion, Tumble, path_quaternions
 from planners.joints import effort, limit_rows, two_sided, within
@@ -43,6 +44,7 @@ class Data(NamedTuple):
     margin: jax.Array  # [] part of the torque kept free
     speed: jax.Array  # [] tolerance while tracking, rad/s and m/s
     weights: jax.Array  # [3] time, torque, smoothness
+    push: pushed.Push | None  # what moves the base
     mission: mission.Mission | None  # what is asked besides
 
 
@@ -92,12 +94,45 @@ def later(tumble: Tumble, time) -> Momentum:
 
 def motion(grid: Grid, x, data: Data) -> tuple[Motion, Motion, Motion]:
     """The motion of approach, tracking and stabilising from the variables by name, physical units."""
-    wait, *T = x["durations"]
+    _, *T = x["durations"]
     approach, track, after = paths(grid, control_points(grid, x, data.q0), T)
     path = tuple(jnp.concatenate([a, b[1:], c]) for a, b, c in zip(approach, track, after, strict=True))
     steps = jnp.concatenate([jnp.broadcast_to(t / n, (n,)) for t, n in zip(T, grid.intervals, strict=True)])
-    first, second, _ = grid.intervals
-    split, grasp = first + second, wait + T[0] + T[1]
+    first, split = grid.intervals[0], sum(grid.intervals[:2])
+    # points and midpoints of the whole grid; the grasp is there twice, once in each structure
+    after_grasp = np.arange(len(path[0])) > 2 * split
+    chains = jax.tree.map(lambda a: a[after_grasp.astype(int)], data.chains)
+    c = floating.couplings(chains, path[0])
+    times, R, momentum, push = (_floats if data.push is None else _pushed)(grid, x, data, c, path[1], steps)
+    # from here on, grid points only
+    points = lambda a: jnp.concatenate([part[::2] for part in _cut(grid, a)])
+    c, chains, (q, rate, acceleration) = jax.tree.map(points, (c, chains, path))
+    p = jax.vmap(floating.base_position, (0, 0, None, 0))(c, R, 0.0, momentum)
+    v = jnp.concatenate([jax.vmap(floating.base_twist)(c, R, rate, momentum), rate], axis=1)
+    tau, vdot = floating.free_torques(chains, c, q, v, acceleration, push=push)
+    whole = Motion(times, R, p, q, v, vdot, tau, push)
+    parts = slice(first + 1), slice(first, split + 1), slice(split + 1, None)
+    return tuple(jax.tree.map(operator.itemgetter(part), whole) for part in parts)
+
+
+def _cut(grid, a):
+    """What holds until the grasp, and from then on, of points and midpoints of the whole grid."""
+    end = 2 * sum(grid.intervals[:2]) + 1
+    return a[:end], a[end:]
+
+
+def _times(grid, x, steps):
+    """Times at grid points; the grasp is there twice."""
+    split, times = sum(grid.intervals[:2]), x["durations"][0] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+    return jnp.concatenate([times[: split + 1], times[split:]])
+
+
+def _floats(grid, x, data, c, rates, steps):
+    """Of a base that floats freely, at grid points: times, attitude, momentum (and the centre of mass at the time), and
+    what pushes it.
+    """
+    wait, *T = x["durations"]
+    split, grasp = sum(grid.intervals[:2]), wait + T[0] + T[1]
     momenta = (
         later(data.waiting, wait),
         floating.momentum_sum(
@@ -105,30 +140,35 @@ def motion(grid: Grid, x, data: Data) -> tuple[Motion, Motion, Motion]:
             (later(data.waiting, grasp), later(data.target, grasp)),
         ),
     )
-    # points and midpoints of the whole grid; the grasp is there twice, once in each structure
-    after_grasp = np.arange(len(path[0])) > 2 * split
-    chains = jax.tree.map(lambda a: a[after_grasp.astype(int)], data.chains)
-    c = floating.couplings(chains, path[0])
-    cut = lambda a: (a[: 2 * split + 1], a[2 * split + 1 :])
-    stages = lambda a: tuple(jnp.concatenate(pair) for pair in zip(*map(floating.thirds, cut(a)), strict=True))
+    stages = lambda a: tuple(map(jnp.concatenate, zip(*map(floating.thirds, _cut(grid, a)), strict=True)))
     angular = jnp.stack([m.angular for m in momenta])[(np.arange(sum(grid.intervals)) >= split).astype(int)]
     R0, _, _ = floating.tumbled(data.waiting, wait)
-    R = floating.attitudes(R0, stages(c.compliance), stages(floating.drift(c, path[1])), angular, steps)
-    # from here on, grid points only
-    points = lambda a: jnp.concatenate([part[::2] for part in cut(a)])
-    c, chains, (q, rate, acceleration) = jax.tree.map(points, (c, chains, path))
+    R = floating.attitudes(R0, stages(c.compliance), stages(floating.drift(c, rates)), angular, steps)
     R = jnp.concatenate([R[: split + 1], R[split:]])
-    times = wait + jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
-    times = jnp.concatenate([times[: split + 1], times[split:]])
-    late = (np.arange(len(q)) > split).astype(int)
-    momentum = jax.tree.map(lambda *m: jnp.stack(m)[late], *momenta)
-    twist = jax.vmap(floating.base_twist)(c, R, rate, momentum)
-    p = jax.vmap(floating.base_position)(c, R, times - jnp.stack([wait, grasp])[late], momentum)
-    v = jnp.concatenate([twist, rate], axis=1)
-    tau, vdot = floating.free_torques(chains, c, q, v, acceleration)
-    whole = Motion(times, R, p, q, v, vdot, tau)
-    parts = slice(first + 1), slice(first, split + 1), slice(split + 1, None)
-    return tuple(jax.tree.map(operator.itemgetter(part), whole) for part in parts)
+    times, late = _times(grid, x, steps), (np.arange(len(R)) > split).astype(int)
+    momentum, starts = jax.tree.map(lambda *m: jnp.stack(m)[late], *momenta), jnp.stack([wait, grasp])[late]
+    mass = jnp.concatenate([part[::2] for part in _cut(grid, c.mass)])
+    drifted = momentum.linear * ((times - starts) / mass)[:, None]
+    return times, R, momentum._replace(centre=momentum.centre + drifted), None
+
+
+def _pushed(grid, x, data, c, rates, steps):
+    """The same of a base that is pushed."""
+    wait, *T = x["durations"]
+    split, grasp = sum(grid.intervals[:2]), wait + T[0] + T[1]
+    grids = [np.linspace(0, 1, 2 * count + 1) for count in grid.intervals]
+    phases = grid.splines, grids, pushed.control_points(x, data.push), T
+    acts = [pushed.acting(*(part[at] for part in phases)) for at in (slice(2), slice(2, None))]
+    moved = c, floating.drift(c, rates)
+    early, late = (jax.tree.map(lambda a, k=k: _cut(grid, a)[k], moved) for k in range(2))
+    R0, _, _ = floating.tumbled(data.waiting, wait)
+    R, before = pushed.driven(later(data.waiting, wait), R0, *early, acts[0], steps[:split])
+    masses, end = (data.waiting.coupling.mass, data.target.coupling.mass), jax.tree.map(lambda a: a[-1], before)
+    start = floating.momentum_sum(masses, (end, later(data.target, grasp)))
+    R_after, after = pushed.driven(start, R[-1], *late, acts[1], steps[split:])
+    halves = zip((R, R_after), (before, after), (act.wrench[::2] for act in acts), strict=True)
+    R, momentum, push = jax.tree.map(lambda *x: jnp.concatenate(x), *halves)
+    return _times(grid, x, steps), R, momentum, push
 
 
 def hand_motion(chains, frame: str, at: Motion):
@@ -185,14 +225,19 @@ class Grasp:
         rates = [s.hull(1) @ p / t for s, p, t in zip(splines, P, T[1:], strict=True)]
         place, turn, spin, slide = relative(data, self.frame, motions[1])
         poses, ends = np.array(self.poses), np.array([0, -1])
+        residual, base = [effort(data, at.times, at.tau, at.vdot[:, 6:]) for at in motions], []
+        if data.push is not None:
+            residual += [pushed.effort(data.push, at.times, at.push) for at in motions]
+            base = [pushed.held(x)]
         below = (
             within(data, *map(jnp.concatenate, (P, rates, [at.tau for at in motions]))),
+            *base,
             two_sided(jnp.concatenate([spin, slide], axis=1), -data.speed / 2, data.speed / 2),
             *mission.below(data, T[0], motions),
         )
         return Values(
             data.weights[0] * T.sum(),
-            jnp.concatenate([effort(data, at.times, at.tau, at.vdot[:, 6:]) for at in motions]),
+            jnp.concatenate(residual),
             jnp.concatenate([e.ravel() for e in (place[poses], turn[poses], spin[ends], slide[ends])]),
             jnp.concatenate(below),
         )
@@ -210,7 +255,9 @@ def rows(task: Task, grid: Grid, poses, fine: float):
     points, torques = sum(s.count for s in grid.splines), sum(grid.intervals) + 3
     steady = Rows("velocity while tracking", 1.0, "rad/s, m/s", (6, grid.intervals[1] + 1, 2))
     limits = limit_rows(task, points, points - 3, torques)
-    return equal, (*limits, steady, *mission.rows(task, fine, grid.intervals))
+    pushes = sum(block.shape[0] for block in pushed.blocks(task, grid.splines))
+    base = () if task.base is None else pushed.limit_rows(pushed.of(task).limits, pushes)
+    return equal, (*limits, *base, steady, *mission.rows(task, fine, grid.intervals))
 
 
 def data(task: Task, fine: float = 1.0) -> Data:
@@ -240,6 +287,7 @@ def data(task: Task, fine: float = 1.0) -> Data:
         jnp.asarray(task.limits.margin),
         jnp.asarray(task.tolerance.speed),
         np.array([w.time, w.torque, w.smoothness]),
+        pushed.of(task),
         mission.of(task, fine),
     )
 
@@ -262,15 +310,15 @@ def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...
     cut = np.cumsum([len(t) for t in times])[:-1]
     targets = [(task.body, *state) for state in zip(*(np.split(x, cut) for x in target), strict=True)]
     passive = dict(zip(task.phases, targets, strict=False))  # all but the last
-    n, free = len(task.joints), lambda tau: np.hstack([np.zeros((len(tau), 6)), tau])
+    n, acting = len(task.joints), lambda tau, push: np.hstack([np.zeros((len(tau), 6)) if push is None else push, tau])
     still = np.tile(task.start, (len(waiting), 1)), np.zeros((len(waiting), n))
     state = [np.hstack([part[: len(waiting)], more]) for part, more in zip(chaser, still, strict=True)]
-    out = [PhaseResult("wait", task.chaser, waiting, *state, free(0 * still[0]), passive["wait"])]
+    out = [PhaseResult("wait", task.chaser, waiting, *state, acting(0 * still[0], None), passive["wait"])]
     for name, at in zip(MOVING, motions, strict=True):
         at = jax.tree.map(np.asarray, at)
         q = np.hstack([at.p, path_quaternions(at.R), at.q])
         robot = task.chaser if name in passive else task.compound
-        out.append(PhaseResult(name, robot, at.times, q, at.v, free(at.tau), passive.get(name)))
+        out.append(PhaseResult(name, robot, at.times, q, at.v, acting(at.tau, at.push), passive.get(name)))
     return tuple(out)
 
 
@@ -309,6 +357,7 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
         Block("grasp_state", (3, n), units),
         Block("end", (n,)),
         *(Block(name, (s.count - 6, n)) for name, s in zip(MOVING, grid.splines, strict=True)),
+        *pushed.blocks(task, grid.splines),
     )
     form = Form(blocks, Grasp(grid, task.robot.frame, tuple(map(int, poses))))
     return Problem(form, data(task, fine), {"durations": low}, {"durations": high}, *rows(task, grid, poses, fine))
@@ -320,7 +369,8 @@ def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
 
     form = problem.form
     more = count if task.clearance is None else max(count, CANDIDATES)
-    z = np.stack([form.join(x) for x in seeds.guesses(task, problem.data, form.values.grid, more)])
+    still = {block.name: 0.0 for block in pushed.blocks(task, form.values.grid.splines)}
+    z = np.stack([form.join(x | still) for x in seeds.guesses(task, problem.data, form.values.grid, more)])
     if more == count:
         return z
     names = [rows.name for rows in problem.below]

@@ -163,7 +163,10 @@ def _base_wrench(chain, x):
 
 
 def _wrench_on_hand(chain, at, p_hand):
-    """Force and moment about the hand, base axes, [k, 3] each: what the chaser alone would need at its free base."""
+    """Force and moment about the hand, base axes, [k, 3] each: what the chaser alone would need at its base, besides
+    what pushes it.
+    """
     wrench = _base_wrench(chain, jnp.concatenate([at.q, at.v, at.vdot], axis=1))
+    wrench = wrench if at.push is None else wrench - at.push
     moment, force = wrench[:, :3], wrench[:, 3:]
     return force, moment - jax.vmap(floating.cross)(p_hand, force)

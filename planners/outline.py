@@ -62,6 +62,8 @@ def _limits(task) -> tuple[str, ...]:
 
 def _cost(task) -> tuple[str, ...]:
     terms, sought = TERMS[type(task.weights).__name__], " and ".join(task.unknown)
+    missing = ("base_torque",) * (task.base is None) + ("base_force",) * (task.base is None or not task.base.force)
+    terms = [term for term in terms if term[0] not in missing]
     weights = ((getattr(task.weights, name), unit, term) for name, unit, term in terms)
     texts = (f"{weight:g}{unit} x {term}" for weight, unit, term in weights if weight)
     if sought:
@@ -69,17 +71,22 @@ def _cost(task) -> tuple[str, ...]:
     return tuple(text for text in texts if "Fisher" not in text)
 
 
+PUSH = (
+    ("base_torque", "/(N^2 m^2 s)", "integral of |moment on the base|^2"),
+    ("base_force", "/(N^2 s)", "integral of |force on the base|^2"),
+)
+ARM = (
+    ("information", "", "-log det of the Fisher information"),
+    ("time", "/s", "duration"),
+    ("torque", "/s", "integral of the mean of (torque / limit)^2"),
+    ("smoothness", " s^3", "integral of the mean of (joint acceleration)^2"),
+)
 TERMS = {
-    "Weights": (
-        ("information", "", "-log det of the Fisher information"),
-        ("time", "/s", "duration"),
-        ("torque", "/s", "integral of the mean of (torque / limit)^2"),
-        ("smoothness", " s^3", "integral of the mean of (joint acceleration)^2"),
-    ),
+    "Weights": ARM,
+    "GraspWeights": (*ARM, *PUSH),
     "Effort": (
         ("time", "/s", "duration"),
-        ("base_torque", "/(N^2 m^2 s)", "integral of |moment on the base|^2"),
-        ("base_force", "/(N^2 s)", "integral of |force on the base|^2"),
+        *PUSH,
         ("joint_torque", "/(N^2 m^2 s)", "integral of |joint torques|^2"),
         ("end_base", " (s^2, s^2/m^2)", "|velocity of the base at the end|^2"),
         ("end_joints", " s^2", "|joint rates at the end|^2"),
@@ -131,10 +138,20 @@ def _of_grasp(task, name) -> PhaseOutline:
         task.compound if together else task.chaser,
         None if together else task.body,
         f"{hand!r} takes {grip!r}: the target joins the robot" if together else "",
-        FLOATS,
-        "duration" if name == "wait" else _splines(task, name),
+        FLOATS if name == "wait" else _pushed(task),
+        "duration" if name == "wait" else _splines(task, name, also=("the base's push",) if task.base else ()),
         holds[name],
     )
+
+
+def _pushed(task) -> str:
+    """What moves the base of a grasp or of a detumbling."""
+    if task.base is None:
+        return FLOATS
+    moment = f"{_range(task.base.torque)} N m"
+    if task.base.force is None:
+        return f"attitude control, at most {moment} about each axis; it is carried along as momentum says"
+    return f"thrusters, at most {moment} and {_range(task.base.force)} N about and along each axis"
 
 
 def _of_reach(task, name) -> PhaseOutline:
@@ -154,7 +171,6 @@ def _of_identify(task, name) -> PhaseOutline:
 
 
 def _of_detumble(task, name) -> PhaseOutline:
-    moment, force = _range(task.base.torque), _range(task.base.force)
     wheels = f"; {', '.join(task.base.wheels)} may spin on" if task.base.wheels else ""
     return PhaseOutline(
         name,
@@ -162,7 +178,7 @@ def _of_detumble(task, name) -> PhaseOutline:
         task.compound,
         None,
         f"{task.robot.frame!r} has taken 'target_{task.target.frame}': the target is part of the robot",
-        f"thrusters, at most {moment} N m and {force} N about and along each axis",
+        _pushed(task),
         _splines(task, name, also=("the base's spline",)),
         (f"base and joints slower than {task.end.speed:g} m/s and rad/s at the end{wheels}",),
     )

@@ -10,11 +10,14 @@ from scipy.integrate import solve_ivp
 
 from planners import grasp, referee_mission, symbolic
 from planners.collocation import (
+    PUSHED,
     Drift,
     base_of,
     collocated,
     drift_of,
+    instant,
     joined,
+    later,
     limit_joints,
     running_cost,
     symbols,
@@ -25,20 +28,21 @@ from planners.referee import Programme, matrix
 TUMBLE = (0.05, 1e-13)  # step of the target's table [s], and the tolerance of what it holds
 
 
-def errors(system: Drift, target: Drift, n: int, hand: str, grip: str) -> ca.Function:
-    """(q, rates, quat, w, target's quat, time) -> the hand relative to the grasp frame [12], as `grasp.relative`."""
-    q, rates, quat, w, quat_t, time = names = symbols(q=n, rates=n, quat=4, w=3, quat_t=4, time=1)
-    base, none = base_of(system, q, rates, quat, w), ca.DM.zeros(0)
-    body = symbolic.rotation(quat_t)
+def errors(system: Drift, target: Drift, n: int, hand: str, grip: str, room: int) -> ca.Function:
+    """(q, rates, quat, w, push, target's quat, time) -> the hand relative to the grasp frame [12], as
+    `grasp.relative`.
+    """
+    q, rates, quat, w, push, *_ = names = symbols(q=n, rates=n, quat=4, w=3, push=room, quat_t=4, time=1)
+    now, none = instant(system, push), ca.DM.zeros(0)
+    base, body = base_of(now, q, rates, quat, w), symbolic.rotation(names[-2])
     twist = _free_twist(target, body)
     frames = []
-    for tree, R, centre, V, frame in (
-        (system.tree, base.R, base.centre, base.twist, (q, rates, hand)),
-        (target.tree, body, symbolic.centre_of_mass(target.tree, none), twist, (none, none, grip)),
+    for drift, R, centre, V, frame in (
+        (now, base.R, base.centre, base.twist, (q, rates, hand)),
+        (later(target, names[-1]), body, symbolic.centre_of_mass(target.tree, none), twist, (none, none, grip)),
     ):
-        drift = system if tree is system.tree else target
-        F, r, spin, slide = symbolic.frame_motion(tree, frame[0], V, *frame[1:])
-        origin = drift.centre + drift.linear * time / tree.mass - R @ centre
+        F, r, spin, slide = symbolic.frame_motion(drift.tree, frame[0], V, *frame[1:])
+        origin = drift.centre - R @ centre
         frames.append((R @ F, origin + R @ r, R @ spin, R @ slide))
     (R_h, p_h, w_h, v_h), (R_g, p_g, w_g, v_g) = frames
     D = R_g.T @ R_h
@@ -79,15 +83,18 @@ def programme(task, problem, z) -> Programme:
     rest = ca.DM.zeros(1, n)
     stops = [ca.vertcat(ca.DM(task.start).T, rest, rest), x["track_state"], x["grasp_state"]]
     stops.append(ca.vertcat(x["end"].T, rest, rest))
-    quat = ca.DM([1, 0, 0, 0])
+    quat, now = ca.DM([1, 0, 0, 0]), alone
     points, rates, paths = [], [], []
     for k, (name, spline) in enumerate(zip(grasp.MOVING, grid.splines, strict=True)):
         powers = ca.vertcat(1, T[k], T[k] ** 2) @ ca.DM.ones(1, n)
         first, last = map(ca.DM, spline.ends)
         P = ca.vertcat(first @ (powers * stops[k]), x[name], last @ (powers * stops[k + 1]))
         system = compound if name == "stabilise" else alone
-        path = collocated(nlp, system, spline, grid.intervals[k], P, T[k], quat)
-        quat = path.quat[:, -1]
+        if task.base and name == "stabilise":
+            now = joined(now, later(target, wait + T[0] + T[1]), task.compound)
+        wrench = _wrench(x, name, problem.data.push) if task.base else None
+        path = collocated(nlp, now if task.base else system, spline, grid.intervals[k], P, T[k], quat, wrench)
+        quat, now = path.quat[:, -1], instant(now, path.push[:, -1])
         points.append(P)
         rates.append(matrix(spline.hull(1)) @ P / T[k])
         paths.append(path)
@@ -98,13 +105,22 @@ def programme(task, problem, z) -> Programme:
     horizon = sum(phase.duration[1] for phase in task.phases.values())
     times = wait + T[0] + T[1] * ca.DM(np.linspace(0, 1, grid.intervals[1] + 1)).T
     attitude = tumbling(target, np.array(task.target.quaternion), horizon)
-    see = errors(alone, target, n, task.robot.frame, f"target_{task.target.frame}").map(track.q.shape[1])
-    e = see(track.q, track.rates, track.quat, track.w, attitude(times), times)
+    room = PUSHED if task.base else 0
+    see = errors(alone, target, n, task.robot.frame, f"target_{task.target.frame}", room).map(track.q.shape[1])
+    e = see(track.q, track.rates, track.quat, track.w, track.push, attitude(times), times)
     at, ends = list(problem.form.values.poses), [0, grid.intervals[1]]
     for rows, where in ((e[:3, :], at), (e[3:6, :], at), (e[6:9, :], ends), (e[9:, :], ends)):
         nlp.equal(rows[:, where])
     limit_joints(nlp, task, points, rates, [path.tau for path in paths])
+    if task.base:
+        nlp.below(ca.vertcat(*(x[f"push_{name}"] for name in grasp.MOVING)), -1, 1)
     nlp.below(e[6:, :].T, -task.tolerance.speed / 2, task.tolerance.speed / 2)
     scene = referee_mission.Scene(alone, target, compound, attitude, paths, wait, T)
     referee_mission.limit(nlp, task, scene)
     return nlp
+
+
+def _wrench(x, name, push):
+    """Control points [count - 2, 6] of moment and force on the base in a phase."""
+    P = ca.vertcat(x["push_approach"][-1, :], x[f"push_{name}"]) if name == "track" else x[f"push_{name}"]
+    return ca.horzcat(P @ ca.diag(ca.DM(push.limits)), ca.DM(P.shape[0], 6 - P.shape[1]))

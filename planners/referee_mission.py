@@ -13,7 +13,7 @@ import numpy as np
 import sdyn
 from planners import solids, symbolic
 from planners.clearance import ROUND, TINY
-from planners.collocation import Drift, Path, base_of, symbols
+from planners.collocation import PUSHED, Drift, Path, base_of, instant, later, on_base, symbols
 from planners.referee import Programme
 
 
@@ -48,7 +48,7 @@ def limit(nlp: Programme, task, scene: Scene) -> None:
         _beyond(nlp, 2 * quat[0, :] ** 2 / ca.sum1(quat**2) - 1, kept * task.base_attitude.turn)
         nlp.below(ca.sum1(w**2).T / (kept * task.base_attitude.rate) ** 2 / 2, -np.inf, 0.5)
     if task.gripper:
-        share = _grip(task, scene, count).map(after.q.shape[1])(*after[:-1])
+        share = _grip(task, scene, count).map(after.q.shape[1])(*after[:-2])
         for k in range(2):
             nlp.below(share[k, :].T / 2, -np.inf, kept**2 / 2)
 
@@ -60,22 +60,23 @@ def _beyond(nlp, cosine, angle):
 
 def _separate(task, scene, waiting):
     """Distances and the cosine of sight, a column each: waiting, approaching, tracking."""
-    q, quat, quat_t, time = names = symbols(q=len(task.joints), quat=4, quat_t=4, time=1)
-    poses = []
-    for drift, Q, joints in ((scene.alone, quat, q), (scene.target, quat_t, ca.DM.zeros(0))):
+    room = scene.paths[0].push.shape[0]
+    q, quat, push, quat_t, time = names = symbols(q=len(task.joints), quat=4, push=room, quat_t=4, time=1)
+    poses, own, other = [], instant(scene.alone, push), later(scene.target, time)
+    for drift, Q, joints in ((own, quat, q), (other, quat_t, ca.DM.zeros(0))):
         R = symbolic.rotation(Q)
-        centre = drift.centre + drift.linear * time / drift.tree.mass
-        poses.append((R, centre - R @ symbolic.centre_of_mass(drift.tree, joints)))
+        poses.append((R, drift.centre - R @ symbolic.centre_of_mass(drift.tree, joints)))
     links = _links(task, q, *poses[0])
     out = [*_distances(task, links, poses[1]), _cosine(task, links, poses[1])]
     see = ca.Function("see", names, [ca.vertcat(*out)])
-    still = (ca.repmat(ca.DM(x), 1, len(waiting)) for x in (task.start, [1, 0, 0, 0]))
+    rest = ca.vertcat(scene.alone.centre, ca.DM(PUSHED - 3, 1))[:room]
+    still = (ca.repmat(ca.DM(x), 1, len(waiting)) for x in (task.start, [1, 0, 0, 0], rest))
     columns, begun = [(*still, scene.wait * ca.DM(waiting).T)], scene.wait
     for path, length in zip(scene.paths[:2], scene.lengths, strict=False):
         s = np.linspace(0, 1, path.q.shape[1])
-        columns.append((path.q, path.quat, begun + length * ca.DM(s).T))
+        columns.append((path.q, path.quat, path.push, begun + length * ca.DM(s).T))
         begun = begun + length
-    return ca.horzcat(*(see.map(q.shape[1])(q, quat, scene.attitude(t), t) for q, quat, t in columns))
+    return ca.horzcat(*(see.map(x[0].shape[1])(*x, scene.attitude(t), t) for *x, t in columns))
 
 
 def _held(task, n) -> ca.Function:
@@ -147,10 +148,12 @@ def _cosine(task, links, target):
 
 
 def _grip(task, scene, n) -> ca.Function:
-    """(q, rates, qdd, quat, w, a) -> squares of force and moment on the hand, relative to their limits."""
-    q, rates, qdd, quat, w, a = names = symbols(q=n, rates=n, qdd=n, quat=4, w=3, a=6)
-    base = base_of(scene.compound, q, rates, quat, w)
+    """(q, rates, qdd, quat, w, a, push) -> squares of force and moment on the hand, relative to their limits."""
+    room = scene.paths[2].push.shape[0]
+    q, rates, qdd, quat, w, a, push = names = symbols(q=n, rates=n, qdd=n, quat=4, w=3, a=6, push=room)
+    base = base_of(instant(scene.compound, push), q, rates, quat, w)
     wrench, _ = symbolic.newton_euler(scene.alone.tree, q, base.twist, rates, a, qdd)
+    wrench = wrench - on_base(push)
     _, p, _, _ = symbolic.frame_motion(scene.alone.tree, q, base.twist, rates, task.robot.frame)
     moment = wrench[:3] - ca.cross(p, wrench[3:])
     share = ca.vertcat(ca.sumsqr(wrench[3:]) / task.gripper.force**2, ca.sumsqr(moment) / task.gripper.torque**2)

@@ -160,13 +160,22 @@ class Capture:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Actuators:
-    """Section [base]: what moves the base, besides the reaction of the joints."""
+class Pushed:
+    """Section [base] of a grasp: what moves the base from the approach on, besides the reaction of the joints; it
+    floats freely if left out.
+    """
 
     torque: tuple = vector(3)
     """Largest moments about the base's axes, at its origin [N m]."""
+    force: tuple | None = vector(3, default=None)
+    """Largest forces along the base's axes [N]; if left out, its attitude is controlled and nothing else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuators(Pushed):
+    """Section [base] of a detumbling."""
+
     force: tuple = vector(3)
-    """Largest forces along the base's axes [N]."""
     wheels: tuple = names()
     """Joints that are reaction wheels: they may spin at the end."""
 
@@ -299,6 +308,16 @@ class Weights:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GraspWeights(Weights):
+    """Section [weights] of a grasp: what pushes the base counts as in a detumbling."""
+
+    base_torque: float = number(0.0, default=1.0)
+    """1/(N^2 m^2 s): times the integral of the squared moment on the base."""
+    base_force: float = number(0.0, default=10.0)
+    """1/(N^2 s): times the integral of the squared force on the base."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Effort:
     """Section [weights] of a cost in physical units: times the duration, and times integrals of squares."""
 
@@ -356,7 +375,8 @@ SECTIONS = {
         "target": Passive,
         "limits": Limits,
         "tolerance": Tolerance,
-        "weights": Weights,
+        "weights": GraspWeights,
+        "base": Pushed,
         "clearance": Clearance,
         "gripper": Gripper,
         "base_attitude": BaseAttitude,
@@ -374,5 +394,5 @@ SECTIONS = {
         "weights": Effort,
     },
 }
-OPTIONAL = ("load", "clearance", "gripper", "base_attitude", "sight")
+OPTIONAL = {"identify": ("load",), "grasp": ("base", "clearance", "gripper", "base_attitude", "sight")}
 NAMED = {"grasp": {"shapes": Solid}}  # sections of sections, with names of their own

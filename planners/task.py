@@ -21,7 +21,6 @@ from planners.sections import (
     OPTIONAL,
     PHASES,
     SECTIONS,
-    Actuators,
     BaseAttitude,
     Capture,
     Chaser,
@@ -33,6 +32,7 @@ from planners.sections import (
     Limits,
     Passive,
     Phase,
+    Pushed,
     Rest,
     Sensors,
     Sight,
@@ -70,7 +70,7 @@ class Task:
     sensors: Sensors | None = None
     goal: Goal | None = None
     capture: Capture | None = None
-    base: Actuators | None = None
+    base: Pushed | None = None
     end: Rest | None = None
     shapes: dict[str, Solid] = field(default_factory=dict)
     clearance: Clearance | None = None
@@ -128,8 +128,8 @@ class Task:
 
     @property
     def base_limits(self) -> np.ndarray:
-        """Largest moments and forces on the base, its axes, [6]; zero where it floats freely."""
-        return np.zeros(6) if self.base is None else np.r_[self.base.torque, self.base.force]
+        """Largest moments and forces on the base, its axes, [6]; zero where there are none."""
+        return np.zeros(6) if self.base is None else np.r_[self.base.torque, self.base.force or np.zeros(3)]
 
     @property
     def captured(self) -> np.ndarray:
@@ -197,7 +197,7 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
     _refuse_unknown(tree, {*SECTIONS[kind], *several, "phases"}, "the task")
     phases = tree.get("phases", {})
     _refuse_unknown(_table(phases, "[phases]"), PHASES[kind], "[phases]")
-    given = {key: record for key, record in SECTIONS[kind].items() if key in tree or key not in OPTIONAL}
+    given = {key: record for key, record in SECTIONS[kind].items() if key in tree or key not in OPTIONAL.get(kind, ())}
     sections = {key: _section(tree.get(key, {}), record, f"[{key}]") for key, record in given.items()}
     sections["phases"] = {p: _section(phases.get(p, {}), Phase, f"[phases.{p}]") for p in PHASES[kind]}
     for key, record in several.items():
@@ -343,6 +343,8 @@ def _checked(task, folder):
         if not 0 <= low <= high or (name != "wait" and low <= 0):
             raise TaskError(f"duration in [phases.{name}] is {[low, high]}; give the shortest and the longest, > 0 s.")
     if task.base:
+        _check_base(task)
+    if task.kind == "detumble":
         _check_detumbling(task)
     if task.kind == "identify":
         return task
@@ -377,5 +379,11 @@ def _check_detumbling(task):
     for name, rate in task.capture.rates.items():
         if abs(rate) > moving[name]:
             raise TaskError(f"[capture] rates: {name!r} has {rate:g}, beyond its limit of {moving[name]:g}.")
-    if not (task.base_limits > 0).all():
-        raise TaskError("torque and force in [base] must be above zero; a base without them floats, as in a grasp.")
+
+
+def _check_base(task):
+    if not (np.r_[task.base.torque, task.base.force or ()] > 0).all():
+        raise TaskError(
+            "torque and force in [base] must be above zero; a grasp without force has a base whose attitude is "
+            "controlled, and one without [base] a base that floats."
+        )

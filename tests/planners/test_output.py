@@ -45,6 +45,7 @@ def plan():
         body=target,
         load_body=None,
         goal=None,
+        base=None,
         shapes={},
         clearance=None,
     )
