@@ -104,6 +104,8 @@ def _splines(task, name, also=()) -> str:
     phase, (low, high) = task.phases[name], task.phases[name].duration
     free = (*(["duration"] if low < high else []), *also)
     points = f"{phase.control_points} control points of each joint's quintic spline, on {phase.intervals} intervals"
+    if task.chaser.loops:
+        points = f"torques of all joints, linear on each of {phase.intervals} intervals"
     return "; ".join([", ".join(free), points] if free else [points])
 
 
@@ -159,6 +161,8 @@ def _of_reach(task, name) -> PhaseOutline:
     turn = "with its orientation" if task.goal.quaternion else "in any orientation"
     goal = f"{task.robot.frame!r} ends at ({place}) m, {turn}"
     holds = (goal, "all joints rest at both ends")
+    if task.chaser.loops:
+        holds += ("loops stay closed",)
     dock, (low, high) = task.robot.dock, task.phases[name].duration
     base = FLOATS if dock is None else f"is held: {dock!r} is docked where it is at the start"
     return PhaseOutline(name, (low, high), task.chaser, None, "", base, _splines(task, name), holds)

@@ -23,7 +23,7 @@ from planners.joints import effort, limit_rows, within
 from planners.motion import rotations
 from planners.plan import PhaseResult
 from planners.problem import ONCE, Block, Form, Problem, Rows, Values
-from planners.task import Task
+from planners.task import Task, TaskError
 
 POSTURES, SPREAD = 8, 0.6  # from which inverse kinematics starts, and how far they are from the start [rad]
 GOLDEN, SECTIONS = (5**0.5 - 1) / 2, 60
@@ -133,7 +133,12 @@ def problem(task: Task, fine: float = 1.0, numbers: Data | None = None, *, still
     """The problem of a task, its grid multiplied by `fine`; its numbers are made unless given.
 
     So many control points are `still` at either end: 3, and accelerations start and end at zero; 2, and they may jump.
+
+    Raises:
+        TaskError: If the robot has closed loops.
     """
+    if task.chaser.loops:
+        raise TaskError("the joints of closed loops are no splines; the solver 'riccati' plans this reach.")
     numbers = data(task) if numbers is None else numbers
     (spline, intervals), n, frame = _shape(task, fine), len(numbers.q0), task.robot.frame
     low, high = task.phases["reach"].duration

@@ -44,6 +44,7 @@ RESUMED = 1e-7  # barrier of a start from an earlier solution
 REGULARISED = (1e-4, 1e8)  # smallest, and where the solver gives up
 SHORT_LONG = (0.2, 0.8)  # parts of a step, below which reg grows and above which it falls
 AUGMENTED = 100.0  # rho: more than multipliers of e that cost about 1, times how much e bends
+DIFFERENCE = 1e-5  # of tangents, for curvature: to 1e-10 of what bends
 REDUNDANT = 1e-11  # of scaled rows of e: what depends on others gets the multiplier of least change
 
 
@@ -136,7 +137,7 @@ def solve(form, data, state: State, until) -> State:
         form: Hashable; what is compiled: `move`, `gap`, `bounded` (the entries of a state that bounds hold, laid out
             like a tangent), `bounds(data)` ([N + 1, x] each), `start(data)` (a state, and 1 for what of its tangent is
             given), `stage(x, u, data)` -> (x of the next knot, r), `rough(x, u, data)`, the same or nearly, which the
-            curvature is of, and `end(x, data)` -> (r, e, smooth).
+            curvature is of, `differenced`, whether by differences, and `end(x, data)` -> (r, e, smooth).
         data: Numbers that the form reads, any pytree; all traced.
         state: From `begin`, or where an earlier call stopped.
         until: Number of iterations, traced.
@@ -188,7 +189,8 @@ def advance(form, data, s: State) -> State:
 def linearised(form, data, x, u, lam, nu) -> Near:
     """The problem near a trajectory: forward mode, one tangent per entry of a stage's state and control.
 
-    What Gauss-Newton leaves out, lam . f'' + r . r'', is that of the rough stage: a gradient, and tangents of it.
+    What Gauss-Newton leaves out, lam . f'' + r . r'', is that of the rough stage: a gradient, and tangents of it, or
+    its differences.
     """
     before, after = _sides(x)
     size, held = jax.eval_shape(jax.vmap(form.bounded), x).shape[1], jax.lax.stop_gradient
@@ -200,12 +202,19 @@ def linearised(form, data, x, u, lam, nu) -> Near:
             new, r = form.stage(*moved(z))
             return form.gap(new, after), r
 
-        def weighed(z):
+        def weighed(z, at=None):
             new, r = form.rough(*moved(z))
-            return lam @ form.gap(new, held(new)) + held(r) @ r
+            here, weight = held((new, r)) if at is None else at
+            return lam @ form.gap(new, here) + weight @ r
+
+        def curvature():
+            if not form.differenced:
+                return _bent(weighed, size + u.size)
+            at = form.rough(x, u, data)  # of all gradients, so that their differences are of them alone
+            return _differenced(lambda z: weighed(z, at), size + u.size)
 
         (d, r), (F, R) = _with_jacobian(f, size + u.size)
-        return r @ r / 2, F[:, :size], F[:, size:], d, R.T @ R, _bent(weighed, size + u.size), R.T @ r
+        return r @ r / 2, F[:, :size], F[:, size:], d, R.T @ R, curvature(), R.T @ r
 
     def end(dx):
         return form.end(form.move(last, dx), data)
@@ -236,6 +245,13 @@ def _bent(f, size):
     """The second derivatives of a scalar f at zero [size, size]: those of its gradient."""
     along = lambda dz: jax.jvp(jax.grad(f), (jnp.zeros(size),), (dz,))[1]
     return jax.vmap(along)(jnp.eye(size))
+
+
+def _differenced(f, size):
+    """The same by central differences of the gradient, of which a quarter is compiled where f is long."""
+    slopes = jax.vmap(jax.grad(f))(DIFFERENCE * jnp.concatenate([jnp.eye(size), -jnp.eye(size)]))
+    H = (slopes[:size] - slopes[size:]) / (2 * DIFFERENCE)
+    return (H + H.T) / 2
 
 
 def _convex(H):

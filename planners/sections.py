@@ -111,6 +111,8 @@ class Chaser:
     """Joint positions at the start [rad or m]; zero where not named."""
     moving: tuple = names()
     """Joints that move; all of them if left out. The others are locked where `joints` has them."""
+    closed: tuple = pairs_of_names()
+    """Pairs of frames that are welded as they are at the start: another hand that holds the load, too."""
     dock: str | None = text(default=None)
     """Frame that a station holds where it is at the start, for a reach; nothing if left out, and the base floats."""
 
@@ -383,7 +385,7 @@ SECTIONS = {
         "sight": Sight,
     },
     "identify": {"robot": Chaser, "load": Held, "limits": Limits, "sensors": Sensors, "weights": Weights},
-    "reach": {"robot": Chaser, "goal": Goal, "limits": Limits, "weights": Weights},
+    "reach": {"robot": Chaser, "load": Held, "goal": Goal, "limits": Limits, "weights": Weights},
     "detumble": {
         "robot": Chaser,
         "target": Held,
@@ -394,5 +396,9 @@ SECTIONS = {
         "weights": Effort,
     },
 }
-OPTIONAL = {"identify": ("load",), "grasp": ("base", "clearance", "gripper", "base_attitude", "sight")}
+OPTIONAL = {
+    "identify": ("load",),
+    "reach": ("load",),
+    "grasp": ("base", "clearance", "gripper", "base_attitude", "sight"),
+}
 NAMED = {"grasp": {"shapes": Solid}}  # sections of sections, with names of their own

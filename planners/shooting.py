@@ -2,7 +2,9 @@
 
 A state is the configuration, the velocity, what acts, and the duration T, which stays; the control is what acts at the
 next knot. So torques are continuous, their squares are integrated exactly, and a free duration is a state that is not
-given at the start. Accelerations cost by their means over the steps of integration. The kind `reach` is stated so.
+given at the start. Accelerations cost by their means over the steps of integration. The kind `reach` is stated so, with
+closed loops too: their motion is that of forward dynamics, projected after each step, and all rest where the joints do
+that the others follow.
 """
 
 import functools
@@ -12,6 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import qr
 
 import sdyn
 from planners import floating, reach
@@ -21,6 +24,10 @@ from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task, TaskError
 
 STEPS = 6  # of RK4 from knot to knot: with one, a slow arm misses its goal by 6e-5 m; with six, by 7e-9 m
+CLOSED, DEPENDENT = (
+    1e-9,
+    1e-9,
+)  # loops at the start [rad, m]; part of the largest pivot, below which rows say nothing new
 TOGETHER = 32  # motions that a certificate follows at once
 
 
@@ -45,6 +52,7 @@ class Data(NamedTuple):
     time: jax.Array  # [] weight of T, 1/s
     effort: jax.Array  # [n] weights of the integrals of the squares of what acts
     smoothness: jax.Array  # [n] and of accelerations
+    independent: jax.Array | None  # [k] joints whose rates say whether all rest; None for all of them
     frame: jax.Array  # [] number of the frame that is to be at the goal
     goal: tuple  # (rotation [3, 3], position [3])
 
@@ -56,10 +64,13 @@ class Shooting:
     Args:
         intervals: Between the knots.
         oriented: Whether the frame has an orientation to be reached, too. All starts and ends at rest, without torque.
+        differenced: Whether curvature is found by differences of gradients: with closed loops, where exact second
+            derivatives take minutes to compile.
     """
 
     intervals: int
     oriented: bool
+    differenced: bool
 
     def move(self, x: State, dx) -> State:
         """Along a tangent: the base turns about its own axes."""
@@ -98,25 +109,26 @@ class Shooting:
         """What acts, laid out like v."""
         return jnp.concatenate([jnp.zeros(6), acts])
 
-    def stage(self, x: State, u, data: Data, steps: int = STEPS):
+    def stage(self, x: State, u, data: Data, steps: int = STEPS, drift="project"):
         """The state at the next knot, and what half the squares of are the cost in between."""
         h = x.T / self.intervals
         force = lambda t, q, v: self.force(x.acts + t / h * (u - x.acts))
-        qs, vs = sdyn.rollout(data.chain, x.q, x.v, force, h / steps, steps=steps)
+        qs, vs = sdyn.rollout(data.chain, x.q, x.v, force, h / steps, steps=steps, drift=drift)
         mean, change = (x.acts + u) / 2, (u - x.acts) / np.sqrt(12)
         effort = jnp.sqrt(2 * h * data.effort) * jnp.stack([mean, change])
         smooth = jnp.sqrt(2 * data.smoothness * steps / h) * jnp.diff(vs[:, 6:], axis=0)
         return State(qs[-1], vs[-1], u, x.T), jnp.concatenate([effort.ravel(), smooth.ravel()])
 
     def rough(self, x: State, u, data: Data):
-        """The same in one step, exact enough for curvature."""
-        return self.stage(x, u, data, 1)
+        """The same in one step, exact enough for curvature; in it, closed loops stay so without help."""
+        return self.stage(x, u, data, 1, 0.0)
 
     def end(self, x: State, data: Data):
         """Residuals of the cost at the end, of which there are none, what must be zero there, and the cost of time."""
         R, p = sdyn.frame_pose(data.chain, x.q, data.frame)
         turn = [floating.logarithm(data.goal[0].T @ R)] if self.oriented else []
-        return jnp.zeros(0), jnp.concatenate([p - data.goal[1], *turn, x.v[6:], x.acts]), data.time * x.T
+        rates = x.v[6:] if data.independent is None else x.v[6:][data.independent]
+        return jnp.zeros(0), jnp.concatenate([p - data.goal[1], *turn, rates, x.acts]), data.time * x.T
 
     def first(self, x, data: Data) -> tuple[State, jax.Array]:
         """The start and the controls, from the variables by name."""
@@ -186,6 +198,7 @@ def data(task: Task, intervals: int, chain: sdyn.Chain | None = None) -> Data:
         time,
         torque / n * d.torque**-2.0,
         np.full(n, smoothness / n),
+        _independent(d.chain, still.q),
         d.frame,
         d.goal,
     )
@@ -207,18 +220,47 @@ def problem(task: Task, fine: float = 1.0, numbers: Data | None = None) -> Probl
     numbers = data(task, intervals) if numbers is None else numbers
     n, frame, points = len(numbers.effort), task.robot.frame, intervals + 1
     free = (Block("duration", (1,), 10.0),) if low < high else ()
-    form = Form((*free, Block("acts", (intervals, n))), Shooting(intervals, oriented), TOGETHER)
+    closed = bool(task.chaser.loops)
+    values = Shooting(intervals, oriented, differenced=closed)
+    form = Form((*free, Block("acts", (intervals, n))), values, TOGETHER, quick=closed)
     equal = (Rows(f"place of {frame!r} at the end", 1.0, "m", (3,)),)
     if oriented:
         equal += (Rows(f"orientation of {frame!r} at the end", 1.0, "rad", (3,)),)
-    equal += (Rows("joint rates at the end", 1.0, "rad/s", (n,)), Rows("torques at the end", 1.0, "N m", (n,)))
+    rates = Rows("joint rates at the end", 1.0, "rad/s", (len(numbers.independent) if closed else n,))
+    equal += (rates, Rows("torques at the end", 1.0, "N m", (n,)))
     below = limit_rows(task, points, points, points, n - len(task.joints))
     return Problem(form, numbers, {"duration": low}, {"duration": high}, equal, below)
 
 
+def _independent(chain: sdyn.Chain, q) -> np.ndarray | None:
+    """Joints that the others follow, as loops have it at the start; None where there are no loops.
+
+    Raises:
+        TaskError: If the loops are not closed at the start.
+    """
+    if not chain.capacity.rows:
+        return None
+    apart, K = map(np.asarray, _loops(chain, q))
+    if (apart := np.abs(apart).max()) > CLOSED:
+        raise TaskError(
+            f"[robot] joints: the loops of the model are open by {apart:.2g} (rad, m) at the start; name joints that "
+            f"close them."
+        )
+    _, R, order = qr(K[:, 6:], pivoting=True)
+    pivots = np.abs(np.diag(R))
+    return np.sort(order[(pivots > DEPENDENT * pivots[0]).sum() :])
+
+
+_loops = jax.jit(lambda chain, q: (sdyn.loop_residual(chain, q), sdyn.loop_jacobian(chain, q)), **ONCE)
+
+
 def first_guesses(task: Task, problem: Problem, count: int) -> list[tuple[State, np.ndarray]]:
-    """States at the knots and controls: the first guesses of the splines there."""
-    fine, out = problem.form.values.intervals / task.phases["reach"].intervals, []
+    """States at the knots and controls: the first guesses of the splines there; with closed loops, to stay."""
+    values, start = problem.form.values, problem.data.start
+    if task.chaser.loops:
+        stay = jax.tree.map(lambda y: np.repeat(np.asarray(y)[None], values.intervals + 1, axis=0), start)
+        return [(stay, stay.acts[1:])]
+    fine, out = values.intervals / task.phases["reach"].intervals, []
     spline = reach.problem(task, fine)
     for z in reach.first_guesses(task, spline, count):
         (at,) = reach.phases(task, spline.data, spline.form.split(z), fine)
@@ -250,7 +292,7 @@ def _detailed(values: Shooting, fine: int, x, data: Data):
 def phases(task: Task, data: Data, x: dict, fine: int) -> tuple[PhaseResult, ...]:
     """The motion on a grid `fine` times finer than the task's knots: what the torques do."""
     intervals = len(x["acts"])
-    values = Shooting(intervals, task.goal.quaternion is not None)
+    values = Shooting(intervals, task.goal.quaternion is not None, differenced=bool(task.chaser.loops))
     found = _detailed(values, round(fine * task.phases["reach"].intervals / intervals), x, data)
     return (PhaseResult("reach", task.chaser, *map(np.asarray, found)),)
 

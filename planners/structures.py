@@ -208,6 +208,10 @@ def _check(task, candidates):
         raise TaskError('planning needs float64; call jax.config.update("jax_enable_x64", True) first.')
     if task.robot.dock:
         raise TaskError(f"the task docks {task.robot.dock!r}; leave dock out of [robot], and give it to candidates.")
+    if task.load or task.chaser.loops:
+        raise TaskError(
+            "the task has a [load], or loops; structures are chosen for open chains with free hands: leave them out."
+        )
     moving = [j.name for j in task.joints]
     if not candidates or not all(structure.joints for structure in candidates):
         raise TaskError("a candidate is missing or moves nothing; give Structure(frame, joints) with joints that move.")

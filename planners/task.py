@@ -205,7 +205,7 @@ def parse(source: str, name: str = "task", folder: Path = FOLDER) -> Task:
         sections[key] = {name: _section(x, record, f"[{key}.{name}]") for name, x in given.items()}
     chaser = _chaser(sections["robot"], folder)
     task = Task(name=name, kind=kind, chaser=chaser, source=source, folder=folder, **sections, **extra)
-    return docked(_checked(_loaded(task, sought), folder))
+    return docked(_checked(_closed(_loaded(task, sought)), folder))
 
 
 def docked(task: Task) -> Task:
@@ -301,9 +301,7 @@ def _chaser(section, folder):
 
 
 def _loaded(task, sought):
-    """The task of an identification with its load in the hand, and with the links whose parameters are sought."""
-    if task.kind != "identify":
-        return task
+    """The task with its load in the hand, and that of an identification with the links whose parameters are sought."""
     bodies = {"base": task.chaser.base}
     if task.load:
         body = _model(task.load.model, task.folder)
@@ -313,11 +311,25 @@ def _loaded(task, sought):
         bodies["load"] = body.links[0].name
         chaser = task.chaser.attach(body, task.robot.frame, f"load_{task.load.frame}")
         task = replace(task, chaser=chaser, load_body=body)
+    if task.kind != "identify":
+        return task
     if not isinstance(sought, list) or not sought or any(x not in ("base", "load") for x in sought):
         raise TaskError(f'parameters is {sought!r}; it must be ["base"], ["load"] or ["base", "load"].')
     if "load" in sought and not task.load:
         raise TaskError('parameters names "load"; add the section [load] with its model.')
     return replace(task, unknown={name: link for name, link in bodies.items() if name in sought})
+
+
+def _closed(task):
+    """The task with the loops of its robot closed as they are at the start."""
+    chaser = task.chaser
+    for one, other in task.robot.closed:
+        chaser = chaser.close(one, other, q=task.first)
+    if chaser.loops and task.kind != "reach":
+        raise TaskError(f"[robot] closes loops; of the kinds of tasks only 'reach' has them, not {task.kind!r}.")
+    if chaser.loops and task.robot.dock:
+        raise TaskError("[robot] closes loops and docks; a robot with loops floats: leave out dock, or closed.")
+    return replace(task, chaser=chaser)
 
 
 def _checked(task, folder):

@@ -14,6 +14,8 @@ from planners import riccati, shooting
 from planners.problem import ONCE
 from planners.task import TaskError, parse
 
+NEAR = jax.jit(riccati.linearised, static_argnums=0, **ONCE)
+
 
 @functools.partial(jax.jit, static_argnums=0, **ONCE)
 def newton(form, data, s):
@@ -52,6 +54,7 @@ class Carts:
         return new, data["weights"] @ jnp.concatenate([x, u]) - data["wish"]
 
     rough = stage
+    differenced = False
 
     def end(self, x, data):
         return x - 1, data["rows"] @ x - data["goal"], 0.3 * x[0]
@@ -140,6 +143,7 @@ class Pendulum:
         return jnp.append(x[:2] + h * slope(middle), x[2]), jnp.sqrt(2 * h) * u
 
     rough = stage
+    differenced = False
 
     def end(self, x, data):
         return jnp.zeros(1), x[:2] - data["goal"], data["time"] * x[2]
@@ -193,6 +197,16 @@ def test_a_problem_with_bounds_and_a_free_duration_is_solved_as_by_another_optim
     assert other.success and abs(found.cost / other.fun - 1) < 1e-7
     assert abs(found.x[0, 2] - other.x[0]) < 1e-4
     assert np.abs(found.x[:, 1]).max() <= 1.0 and found.zu[:, 1].max() > 0.01  # the bound of the rate is active
+
+
+def test_curvature_by_differences_is_that_of_second_derivatives(rng):
+    class Differenced(Pendulum):
+        differenced = True
+
+    data = pendulum()
+    x, u, lam, nu = rng.uniform(1, 2, (17, 3)), rng.normal(size=(16, 1)), rng.normal(size=(17, 3)), np.zeros(2)
+    exact, near = (NEAR(form, data, x, u, lam, nu).C for form in (PENDULUM, Differenced()))
+    assert np.abs(near - exact).max() < 1e-9 * np.abs(exact).max()
 
 
 def test_other_numbers_compile_nothing_and_many_are_solved_at_once():
