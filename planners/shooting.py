@@ -24,10 +24,8 @@ from planners.problem import ONCE, Block, Form, Problem, Rows, Values
 from planners.task import Task, TaskError
 
 STEPS = 6  # of RK4 from knot to knot: with one, a slow arm misses its goal by 6e-5 m; with six, by 7e-9 m
-CLOSED, DEPENDENT = (
-    1e-9,
-    1e-9,
-)  # loops at the start [rad, m]; part of the largest pivot, below which rows say nothing new
+CLOSED = 1e-9  # of loops at the start [rad, m]
+DEPENDENT = 1e-9  # part of the largest pivot, below which rows of loops say nothing new
 TOGETHER = 32  # motions that a certificate follows at once
 
 
