@@ -53,20 +53,22 @@ class Detumble:
     intervals: int
     resting: tuple[int, ...]
 
-    def control_points(self, x, data: Data):
-        """Control points [count, 6 + n] from the variables by name."""
+    def along(self, points, x, data: Data):
+        """What a map of the control points [k, count] gives, [k, 6 + n], from the variables by name: the map is joined
+        to theirs first, or rounding of the control points would be as large as velocities at the end.
+        """
         T, (braking, bent) = x["duration"][0], self.spline.between
         ends = jnp.stack([data.start.x, T * data.start.rate, T * x["end"]])
-        return braking @ ends + T**2 * bent @ (data.start.reply @ x["efforts"]).T
+        return points @ braking @ ends + T**2 * (points @ bent) @ (data.start.reply @ x["efforts"]).T
 
     def curve(self, x, data: Data):
         """The coordinates and their first two derivatives by time at the grid's points, [k + 1, 6 + n] each."""
-        s, P = np.linspace(0, 1, self.intervals + 1), self.control_points(x, data)
-        return tuple(self.spline.basis(s, order) @ P / x["duration"][0] ** order for order in range(3))
+        s, T = np.linspace(0, 1, self.intervals + 1), x["duration"][0]
+        return tuple(self.along(self.spline.basis(s, order), x, data) / T**order for order in range(3))
 
     def __call__(self, x, data: Data) -> Values:
         """The values for variables by name, physical units."""
-        T, P, resting = x["duration"][0], self.control_points(x, data), np.array(self.resting)
+        T, P, resting = x["duration"][0], self.along(np.eye(self.spline.count), x, data), np.array(self.resting)
         acting, v = flying.acting(data.chain, *self.curve(x, data))
         root = jnp.sqrt(2 * trapezoid(jnp.broadcast_to(T / self.intervals, (self.intervals,))))
         effort = root[:, None] * jnp.sqrt(data.weights) * acting
@@ -120,14 +122,16 @@ def _shape(task, fine) -> Detumble:
 
 
 def _scales(task, numbers) -> tuple[tuple, tuple]:
-    """Rates at the end, and efforts that cost about 1 or reach a limit: the next powers of ten, so that slightly other
-    numbers compile nothing.
+    """Rates at the end, and efforts that cost about 1, reach a limit, or turn base and joints by about 1 rad: the next
+    powers of ten, so that slightly other numbers compile nothing.
     """
     duration, limits = np.sqrt(np.prod(task.phases["stabilise"].duration)), np.r_[task.base_limits, task.torque_limits]
-    efforts = (2 * duration * np.asarray(numbers.weights) + limits**-2.0) ** -0.5
     wheels = [6 + k for k, joint in enumerate(task.joints) if joint.name in task.base.wheels]
+    reply = np.asarray(numbers.start.reply)
+    turned = duration**2 * np.linalg.norm(np.delete(reply, [0, 1, 2, *wheels], axis=0), axis=0)
+    efforts = (2 * duration * np.asarray(numbers.weights) + limits**-2.0 + turned**2) ** -0.5
     rates = np.full(len(limits), task.end.speed)
-    rates[wheels] = (duration * efforts * np.diag(numbers.start.reply))[wheels]
+    rates[wheels] = (duration * efforts * np.diag(reply))[wheels]
     return tuple(tuple((10.0 ** np.round(np.log10(x))).tolist()) for x in (rates, efforts))
 
 
@@ -146,14 +150,42 @@ def problem(task: Task, fine: float = 1.0) -> Problem:
     )
 
 
+@functools.partial(jax.jit, static_argnums=0, **ONCE)
+def _braking(values: Detumble, x, data: Data):
+    """The base's rotation vectors [k + 1, 3] at the grid's points, and attitudes if angular momentum falls evenly."""
+    s, T = np.linspace(0, 1, 2 * values.intervals + 1), x["duration"][0]
+    path, rate = (values.along(values.spline.basis(s, order), x, data) / T**order for order in range(2))
+    return path[::2, 3:6], flying.calmed(data.chain, data.start, path[:, 6:], rate[:, 6:], T)
+
+
+def _braked(problem: Problem, T: float) -> np.ndarray:
+    """Efforts [6 + n, count - 3] of even braking, in which the base follows from its angular momentum: its own even
+    braking would move it against the joints' reactions.
+    """
+    form, values, data = problem.form, problem.form.values, problem.data
+    x = form.split(form.join({"duration": T, "end": 0.0, "efforts": 0.0}))
+    even, R = map(np.asarray, _braking(values, x, data))
+    quat = floating.path_quaternions(R)
+    half = np.linalg.norm(quat[:, 1:], axis=1, keepdims=True)
+    theta = 2 * np.arctan2(half, quat[:, :1]) * quat[:, 1:] / np.maximum(half, np.finfo(float).tiny)
+    basis, (_, bent) = values.spline.basis(np.linspace(0, 1, len(R))), values.spline.between
+    moved = np.zeros((len(data.rest), bent.shape[1]))
+    moved[3:6] = np.linalg.lstsq(T**2 * basis @ bent, theta - even)[0].T
+    return np.linalg.solve(data.start.reply, moved)
+
+
 def first_guesses(task: Task, problem: Problem, count: int) -> np.ndarray:
     """Even braking [count, n], scaled; several differ in duration and from even."""
     form, (low, high) = problem.form, task.phases["stabilise"].duration
     rng, (_, _, bent) = np.random.default_rng(0), form.blocks
-    guesses = [form.join({"duration": np.sqrt(low * high), "end": 0.0, "efforts": 0.0})]
+
+    def guess(T, away=0.0):
+        return form.join({"duration": T, "end": 0.0, "efforts": _braked(problem, T) + away * bent.unit})
+
+    guesses = [guess(np.sqrt(low * high))]
     for _ in range(count - 1):
-        T, away = np.sqrt(low * high) * (high / low) ** rng.uniform(-0.4, 0.4), rng.normal(size=bent.shape)
-        guesses.append(form.join({"duration": T, "end": 0.0, "efforts": away * bent.unit}))
+        T = np.sqrt(low * high) * (high / low) ** rng.uniform(-0.4, 0.4)
+        guesses.append(guess(T, rng.normal(size=bent.shape)))
     return np.stack(guesses)
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import sdyn
 from planners import floating
@@ -70,6 +71,19 @@ def start(chain, q, v) -> Start:
 
     reply = jax.vmap(rate, 1, 1)(jnp.linalg.inv(M))
     return Start(jnp.concatenate([c.centre, jnp.zeros(3), q[7:]]), rate(v), reply)
+
+
+def calmed(chain, start: Start, q, rate, T):
+    """Attitudes [k + 1, 3, 3] of the base over T seconds while the angular momentum falls evenly to zero, from joints
+    and their rates at points and midpoints of a grid, [2 k + 1, n] each.
+    """
+    c, k = floating.couplings(chain, q), len(q) // 2
+    drift = floating.drift(c, rate)
+    angular = jnp.linalg.solve(c.compliance[0], start.rate[3:6] - drift[0])
+    left = 1 - (np.arange(k) + 0.5) / k
+    steps = jnp.full(k, T / k)
+    compliance, drift = floating.thirds(c.compliance), floating.thirds(drift)
+    return floating.attitudes(jnp.eye(3), compliance, drift, left[:, None] * angular, steps)
 
 
 @floating.locally

@@ -41,6 +41,9 @@ TEACHES = 1e-2  # least cosine of a step and the change it teaches; a smaller on
 RADII = (1e-6, 0.1, 2.0)  # trust region, scaled variables: smallest, at least after a larger penalty, largest
 WIDE = 1e3  # scaled: a trust region that is none
 STEER = (0.3, 0.1)  # parts of the violation: one left by a step asks for more penalty, one gained is worth it
+# Least curvature, of the largest: rounding and no more. Where all that moves little costs little, as with small joints
+# under a heavy base, minima may be flatter than 1e-8, and a larger floor would shorten each step along them.
+FLOOR = 1e-13
 IDLE = 2  # iterations without progress after which more penalty is tried anyway
 PATIENCE = 8  # iterations without progress
 # Iterations in which neither the violation falls by a hundredth, nor the merit by more than the violation counts in it,
@@ -103,7 +106,7 @@ def direction(s: State, low, high, penalty) -> Step:
     near = s.near
     H = near.curvature + s.left_out
     values, vectors = jnp.linalg.eigh((H + H.T) / 2)
-    floor = 1e-8 * jnp.maximum(jnp.abs(values).max(), 1.0)
+    floor = FLOOR * jnp.maximum(jnp.abs(values).max(), 1.0)
     H = (vectors * jnp.maximum(jnp.abs(values), floor)) @ vectors.T
     box = jnp.maximum(low - s.z, -s.radius), jnp.minimum(high - s.z, s.radius)
     d, y, u = qp.solve(qp.Programme(H, near.gradient, near.A, near.equal, near.C, near.below, *box, penalty))

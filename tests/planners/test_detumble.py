@@ -165,6 +165,21 @@ def test_the_published_detumbling():
     assert abs(found["duration_s"] / PUBLISHED["duration"] - 1) < 0.02  # measured 4.136 s, and 4.095
 
 
+@pytest.mark.slow
+def test_thirteen_degrees_of_freedom_from_a_tumbling_target():
+    """The first guess keeps every limit, the duration is free, and the referee has the same minimum."""
+    plan = planners.plan(planners.load("detumble_deos"), progress=False)
+    assert plan.status == "solved" and plan.certificate.passed, plan.verdict
+    problem = detumble.problem(plan.task)
+    guess = jax.jit(problem.form.at)(detumble.first_guesses(plan.task, problem, 1)[0], problem.data)
+    assert guess.below.max() <= 0
+    low, high = plan.task.phases["stabilise"].duration
+    assert low + 1 < plan.info["results"]["duration_s"] < high - 1  # free: measured 7.30 s
+    end = referee.programme(plan.task, problem, problem.form.join(plan.variables), near=True).solve()
+    assert end.status == "solved"
+    assert abs(end.cost / plan.info["cost"] - 1) < 1e-7  # measured 3e-9
+
+
 WHEELS = """
 kind = "detumble"
 [robot]
