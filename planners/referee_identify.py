@@ -124,7 +124,7 @@ def programme(task, problem, z) -> Programme:
 
     def shown(basis):
         """At the points, what the sensors see, and of every interval, how far the base turns."""
-        seen, spin = sensitivities(system, task, basis).map(K)(*path[:-1])
+        seen, spin = sensitivities(system, task, basis).map(K)(path.q, path.rates, path.qdd, path.quat, path.w, path.a)
         return seen, h * (spin[:, 1:] + spin[:, :-1]) / 2
 
     running = lambda turns: ca.horzcat(ca.DM.zeros(turns.shape[0], 1), ca.cumsum(turns, 1))
