@@ -65,7 +65,7 @@ def test_the_referee_stays_where_the_default_solver_went(plan):
 
 
 def test_the_referee_states_the_same_cost():
-    """With a load and biases, at the first guess; its other transcription of the base's motion is as exact as the grid."""
+    """With a load and biases, at the first guess; its other transcription of the motion is as exact as the grid."""
     task = planners.load("identify_load")
     problem = identify.problem(task)
     (z,) = identify.first_guesses(task, problem, 1)
